@@ -26,7 +26,7 @@ DEGENERATE_VOLUME_RATIO = 1e-6
 class TetMesh:
     """A connected body of tetrahedra, in metres, every tet with positive volume.
 
-    Tets given inside out are reoriented and counted in `reoriented_count`. Arrays are copied to contiguous
+    Tets given inside out are reoriented. Arrays are copied to contiguous
     native float64 / int32 and made read-only.
 
     Args:
@@ -43,7 +43,6 @@ class TetMesh:
     tets: IntArray
     region: IntArray
     region_names: tuple[tuple[int, str], ...]
-    reoriented_count: int = field(init=False, default=0)
     # The mesh that `moved` made this one from.
     origin: "TetMesh | None" = field(init=False, default=None)
 
@@ -56,14 +55,13 @@ class TetMesh:
     ) -> None:
         point_array = _checked_points(points)
         tet_array = _checked_tets(tets, len(point_array))
-        tet_array, reoriented_count = _oriented(point_array, tet_array)
+        tet_array, _ = _oriented(point_array, tet_array)
         _check_faces(tet_array)
         pairs = region_names.items() if isinstance(region_names, dict) else region_names
         object.__setattr__(self, "points", _frozen(point_array))
         object.__setattr__(self, "tets", _frozen(tet_array))
         object.__setattr__(self, "region", _frozen(_checked_region(region, len(tet_array))))
         object.__setattr__(self, "region_names", tuple((int(tag), str(name)) for tag, name in pairs))
-        object.__setattr__(self, "reoriented_count", reoriented_count)
 
     @property
     def node_count(self) -> int:
@@ -91,7 +89,7 @@ class TetMesh:
         other = object.__new__(TetMesh)
         kept = {name: getattr(self, name) for name in ("tets", "region", "region_names", "_edge_table", "_boundary")}
         origin = self if self.origin is None else self.origin
-        vars(other).update(points=_frozen(array), reoriented_count=0, origin=origin, **kept)
+        vars(other).update(points=_frozen(array), origin=origin, **kept)
         return other
 
     def region_tag(self, name: str) -> int:

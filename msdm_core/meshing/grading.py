@@ -28,7 +28,6 @@ from msdm_core.meshing.stuffing import (
     lattice_around,
 )
 
-CELLS_ACROSS_MIN = 2
 COARSENINGS = (1, 2, 4)  # largest / smallest cell edge of a lattice, per level of the largest
 
 # Share of an edge within which a node of any but a BCC tet moves onto the surface. On 16 bumpy bodies with randomly
@@ -53,16 +52,6 @@ def coarsest_level(size: float, coarse_cell_size: float) -> int:
         f"coarse_cell_size {coarse_cell_size:g} m is {ratio:g} times cell_size {size:g} m; "
         f"the rule is 1, 2 or 4 times: use {2 * size:g} or {4 * size:g} m"
     )
-
-
-def check_coarse_cell_size(points: FloatArray, size: float, coarsest: int) -> None:
-    """Refuse coarse cells of which fewer than CELLS_ACROSS_MIN fit across the surface's smallest extent."""
-    coarse, smallest = size * 2**coarsest, np.ptp(points, axis=0).min()
-    if smallest < CELLS_ACROSS_MIN * coarse:
-        raise MeshError(
-            f"coarse_cell_size {coarse:g} m is too coarse: the surface is {smallest:.4g} m across its smallest extent, "
-            f"the rule is at least {CELLS_ACROSS_MIN} cells: use {coarse / 2:g} m, or a smaller cell_size"
-        )
 
 
 def stuff_graded(

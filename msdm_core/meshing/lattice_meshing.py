@@ -17,10 +17,8 @@ from msdm_core.mesh.ordering import swept
 from msdm_core.mesh.surface import Int64Array, check_surface, surface_volume
 from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, tet_volumes
 from msdm_core.meshing.grading import (
-    CELLS_ACROSS_MIN,
     COARSENINGS,
     balanced_levels,
-    check_coarse_cell_size,
     coarsest_level,
     octree_tets,
     stuff_graded,
@@ -29,6 +27,7 @@ from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
 
 STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
 TETS_PER_CELL = 12
+CELLS_ACROSS_MIN = 2
 TET_LIMIT = 2_000_000
 GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
 
@@ -149,7 +148,6 @@ def mesh_surface(
     points, corners = check_surface(vertices, triangles)
     check_cell_size(np.ptp(points, axis=0), surface_volume(points, corners), size)
     if coarsest:
-        check_coarse_cell_size(points, size, coarsest)
         fine = corners if fine_triangles is None else corners[fine_triangles]
         if not len(fine):
             raise MeshError(

@@ -46,22 +46,18 @@ class RegionShare:
 
 @dataclass(frozen=True, eq=False)
 class FilledLabels:
-    """A label image filled with tets, and the change of its volume.
+    """A label image filled with tets.
 
     Fields:
         mesh: tags are the labels, in metres from the centre of voxel (0, 0, 0).
         label_volume: of the voxels that were filled, the largest part [m^3].
         region_volumes: of the voxels of each label of the mesh [m^3].
-        smoothing: standard deviation of the Gaussian [m].
-        smoothing_change: of the volume by smoothing alone, as a share; the level is moved to make up for it.
         dropped: voxels of the parts that do not hang together with the largest by faces, largest first.
     """
 
     mesh: TetMesh
     label_volume: float
     region_volumes: dict[int, float]
-    smoothing: float
-    smoothing_change: float
     dropped: tuple[int, ...]
 
     @property
@@ -139,12 +135,10 @@ def fill_labels(
     volume = float(np.count_nonzero(organ)) * float(np.prod(step))
     check_cell_size(np.array(organ.shape) * step, volume, cell_size)
     field = smoothed_share(organ, corner, step, cell_size)
-    mesh, change = _filled_to_volume(field, volume, cell_size, fine_face)
+    mesh = _filled_to_volume(field, volume, cell_size, fine_face)
     inside = np.where(organ, inside, 0)
     region, volumes = _regions(mesh, inside, corner, step, names)
-    return FilledLabels(
-        TetMesh(mesh.points, mesh.tets, region, names), volume, volumes, field.smoothing, change, dropped
-    )
+    return FilledLabels(TetMesh(mesh.points, mesh.tets, region, names), volume, volumes, dropped)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,11 +264,8 @@ def smoothed_share(
     return SmoothedShare(values, start, block, smoothing)
 
 
-def _filled_to_volume(
-    field: SmoothedShare, volume: float, cell_size: float, fine_face: FineFace | None
-) -> tuple[TetMesh, float]:
-    """The mesh whose volume is nearest to the wanted one [m^3], and the share by which smoothing alone changed it."""
-    change = field.volume_above(0.5) / volume - 1.0
+def _filled_to_volume(field: SmoothedShare, volume: float, cell_size: float, fine_face: FineFace | None) -> TetMesh:
+    """The mesh whose volume is nearest to the wanted one [m^3]."""
     level, best = 0.5, None
     # Volume lost as the level rises; the secant through the last two meshes takes over.
     slope = (field.volume_above(0.4) - field.volume_above(0.6)) / 0.2
@@ -291,7 +282,7 @@ def _filled_to_volume(
         before = (level, error)
         level = float(np.clip(level + error / slope, *LEVEL_RANGE))
     assert best is not None
-    return best[1], change
+    return best[1]
 
 
 def _mesh_above(field: SmoothedShare, level: float, cell_size: float, fine_face: FineFace | None) -> TetMesh:

@@ -102,17 +102,11 @@ def verdict(found: PatientScene) -> str:
 
 def _source(found: PatientScene) -> Rows:
     patient = found.patient
-    rows: Rows = [
+    return [
         ("files", ", ".join(patient.sources)),
         ("axes", patient.convention),
         ("mesher", f"{patient.mesher}, {patient.cells_text}"),
     ]
-    if patient.smoothing is not None and patient.smoothing_change is not None:
-        change = (
-            f"by itself it changed the volume by {patient.smoothing_change:+.2%}, which a shift of the level corrects"
-        )
-        rows.append(("smoothing", f"Gaussian of {patient.smoothing * 1e3:.3g} mm; {change}"))
-    return rows
 
 
 def _volumes(found: PatientScene) -> Rows:

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.tet_mesh import TetMesh
@@ -70,7 +70,7 @@ def write_mesh(path: str | Path, mesh: TetMesh) -> None:
     file = Path(path)
     if file.suffix.lower() != WRITTEN_SUFFIX:
         raise ValueError(f"{file}: meshes are written as {WRITTEN_SUFFIX}; meshio convert makes other formats of it")
-    cell_data = {"region": [np.array(mesh.region, dtype=np.int64)]}
+    cell_data: dict[str, list[ArrayLike]] = {"region": [np.array(mesh.region, dtype=np.int64)]}
     out = meshio.Mesh(mesh.points, [("tetra", np.array(mesh.tets))], cell_data=cell_data)
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder) / "mesh"

@@ -74,6 +74,7 @@ class Outcome(NamedTuple):
 
 
 def mesh_cases(folder: Path) -> Iterator[Files]:
+    import meshio
     import trimesh
 
     from msdm_core.mesh.tet_mesh import TetMesh
@@ -83,8 +84,9 @@ def mesh_cases(folder: Path) -> Iterator[Files]:
     block = box_mesh((0.04, 0.03, 0.02), (4, 3, 2))
     region = (block.points[block.tets].mean(axis=1)[:, 0] > 0.02).astype(np.int32)
     mesh = TetMesh(block.points, block.tets, region, {0: "liver", 1: "lesion"})
-    for name, file_format in (("a.vtu", None), ("a.vtk", None), ("a.msh", "gmsh"), ("a.mesh", None)):
-        write_mesh(folder / name, mesh, file_format=file_format)
+    write_mesh(folder / "a.vtu", mesh)
+    for name, file_format in (("a.vtu", "vtu"), ("a.vtk", "vtk"), ("a.msh", "gmsh22"), ("a.mesh", "medit")):
+        meshio.read(folder / "a.vtu").write(folder / name, file_format=file_format)
         yield {name: (folder / name).read_bytes()}
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
     for name in ("a.stl", "a.ply", "a.obj"):
@@ -100,13 +102,13 @@ def cells_of(size: float) -> Any:
 
 
 def read_mesh_file(path: Path) -> object:
+    from msdm_core.mesh_files.mesh_io import read_mesh
     from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
     from surgsim_env.patient.meshers import mesh_surfaces, read_surfaces
-    from surgsim_env.patient.tet_files import read_tets
 
     if path.suffix in SURFACE_SUFFIXES:
-        return mesh_surfaces(read_surfaces([path], (), "m", mend=False), cells=cells_of(0.01), mesher="lattice")
-    return read_tets(path, None, ())
+        return mesh_surfaces(read_surfaces([path], "m", mend=False), cells=cells_of(0.01), mesher="lattice")
+    return read_mesh(path, length_unit="m")
 
 
 def scene_cases(_folder: Path) -> Iterator[Files]:

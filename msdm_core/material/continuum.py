@@ -1,4 +1,4 @@
-"""Solids at finite strain: the continuum of stiffening springs, Fung's and Ogden's, and springs fitted to them.
+"""The continuum of stiffening springs at finite strain, alone in a bar and in simple shear.
 
 Springs in all directions that deform with the continuum are the affine micro-sphere model (Miehe, Göktepe and Lulei
 2004, doi 10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch l =
@@ -9,25 +9,16 @@ mean. Each node is a centre of symmetry, so that a homogeneous deformation of th
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 
-from msdm_core.material.tissue_law import TANGENT_CAP_LARGEST, Stiffening
+from msdm_core.material.tissue_law import Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 
 # The least strain that is divided by.
 STRAIN_LEAST = 1e-12
 # Directions of a quadrature over the sphere: exact to degree 2 DIRECTION_ORDER - 1.
 DIRECTION_ORDER = 12
-
-
-class Solid(Protocol):
-    """A hyperelastic solid."""
-
-    def first_piola(self, gradient: FloatArray) -> FloatArray:
-        """First Piola-Kirchhoff stress [Pa] of deformation gradients F, both (..., 3, 3)."""
-        ...
 
 
 @lru_cache(maxsize=4)
@@ -138,59 +129,7 @@ _PERMUTATION[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 _PERMUTATION[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
 
 
-@dataclass(frozen=True)
-class Demiray:
-    """The isotropic solid of Fung's type, W = mu / (2 b) (exp(b (J^(-2/3) I1 - 3)) - 1) + (K / 2) (J - 1)^2.
-
-    Demiray 1972 (J Biomech 5:309-311) has the incompressible form.
-
-    Args:
-        shear_modulus: mu at small strain [Pa].
-        exponent: b, 0 for a neo-Hookean solid.
-        bulk_modulus: K [Pa].
-    """
-
-    shear_modulus: float
-    exponent: float
-    bulk_modulus: float
-
-    def first_piola(self, gradient: FloatArray) -> FloatArray:
-        """P = mu e^(b (I - 3)) J^(-2/3) (F - I1 / (3 J) dJ/dF) + K (J - 1) dJ/dF [Pa], I = J^(-2/3) I1, (..., 3, 3)."""
-        volume, cofactor = determinant_and_cofactor(gradient)
-        first = np.einsum("...ij,...ij->...", gradient, gradient)
-        part = volume ** (-2.0 / 3.0)
-        scale = self.shear_modulus * np.exp(self.exponent * (part * first - 3.0)) * part
-        pressure = self.bulk_modulus * (volume - 1.0) - scale * first / (3.0 * volume)
-        return scale[..., None, None] * gradient + pressure[..., None, None] * cofactor
-
-
-@dataclass(frozen=True)
-class Ogden:
-    """Ogden's solid of one term, W = (2 mu / a^2) (sum (J^(-1/3) l_i)^a - 3) + (K / 2) (J - 1)^2.
-
-    Ogden 1972 (doi 10.1098/rspa.1972.0026) writes mu_1 = 2 mu / a; l_i are the principal stretches.
-
-    Args:
-        shear_modulus: mu at small strain [Pa].
-        exponent: a, not 0; large ones stiffen, a sign tells tension from compression.
-        bulk_modulus: K [Pa].
-    """
-
-    shear_modulus: float
-    exponent: float
-    bulk_modulus: float
-
-    def first_piola(self, gradient: FloatArray) -> FloatArray:
-        """P = U diag(dW/dl_i) V^T [Pa], F = U diag(l_i) V^T, (..., 3, 3)."""
-        left, stretch, right = np.linalg.svd(gradient)
-        volume = stretch.prod(axis=-1, keepdims=True)
-        powers = (stretch * volume ** (-1.0 / 3.0)) ** self.exponent
-        shape = 2.0 * self.shear_modulus / self.exponent * (powers - powers.mean(axis=-1, keepdims=True))
-        slope = (shape + self.bulk_modulus * (volume - 1.0) * volume) / stretch
-        return np.einsum("...ik,...k,...kj->...ij", left, slope, right)
-
-
-def uniaxial_stress(solid: Solid, stretch: FloatArray) -> FloatArray:
+def uniaxial_stress(solid: SpringSolid, stretch: FloatArray) -> FloatArray:
     """Force over the area at rest [Pa] of a bar with free sides at some stretches, both (n,).
 
     Raises:
@@ -200,7 +139,7 @@ def uniaxial_stress(solid: Solid, stretch: FloatArray) -> FloatArray:
     return solid.first_piola(bar_gradient(stretch, stretch_across(solid, stretch)))[..., 0, 0]
 
 
-def stretch_across(solid: Solid, stretch: FloatArray) -> FloatArray:
+def stretch_across(solid: SpringSolid, stretch: FloatArray) -> FloatArray:
     """Stretch across a bar with free sides at some stretches along it, both (n,), by Newton's method.
 
     Raises:
@@ -227,92 +166,9 @@ def bar_gradient(along: FloatArray, across: FloatArray) -> FloatArray:
     return gradient
 
 
-def simple_shear_stress(solid: Solid, amount: FloatArray) -> FloatArray:
+def simple_shear_stress(solid: SpringSolid, amount: FloatArray) -> FloatArray:
     """Shear stress P_12 [Pa] in simple shear x = X + g Y of some amounts g, both (n,)."""
     amount = np.asarray(amount, dtype=np.float64)
     gradient = np.broadcast_to(np.eye(3), (*amount.shape, 3, 3)).copy()
     gradient[..., 0, 1] = amount
     return solid.first_piola(gradient)[..., 0, 1]
-
-
-# The springs of a fit are compared with a solid at so many stretches in tension, in compression, and amounts of shear.
-FIT_POINTS = 10
-
-
-@dataclass(frozen=True)
-class SpringFit:
-    """Stiffening springs fitted to a solid.
-
-    Args:
-        youngs_modulus: at small strain [Pa].
-        stiffening: of the springs.
-        tension_error, compression_error, shear_error: largest relative error of the stress in each test.
-    """
-
-    youngs_modulus: float
-    stiffening: Stiffening
-    tension_error: float
-    compression_error: float
-    shear_error: float
-
-
-def fit_springs(
-    solid: Solid,
-    *,
-    strain: float,
-    poisson_ratio: float = 0.45,
-    directions: tuple[FloatArray, FloatArray] | None = None,
-) -> SpringFit:
-    """Modulus and law of stiffening springs whose uniaxial tension, compression and simple shear are those of a solid.
-
-    Least squares of the relative errors of the stress, for stretches 1 - strain to 1 + strain and shear up to strain.
-
-    Args:
-        solid: such as `Demiray` or `Ogden` with published parameters.
-        strain: largest strain of the tests, from 0.05 to 0.5.
-        poisson_ratio: of the springs with their volume term.
-        directions: of the springs; by default all. `lattice_directions()` for tests along the axes of a lattice.
-
-    Raises:
-        ValueError: a strain or ratio out of range, or a solid without equilibrium in these tests.
-    """
-    from scipy.optimize import least_squares
-
-    if not 0.05 <= strain <= 0.5:
-        raise ValueError(f"the strain of the fit is {strain:g}; it must be from 0.05 to 0.5")
-    if not 0.25 <= poisson_ratio < 0.5:
-        raise ValueError(f"poisson_ratio is {poisson_ratio:g}; springs with a volume term have 0.25 <= nu < 0.5")
-    added = (4.0 * poisson_ratio - 1.0) / (1.0 - 2.0 * poisson_ratio)
-    amount = strain * np.arange(1, FIT_POINTS + 1) / FIT_POINTS
-    everywhere = sphere_directions() if directions is None else directions
-
-    def stresses(one: Solid) -> FloatArray:
-        return np.array([
-            uniaxial_stress(one, 1.0 + amount), uniaxial_stress(one, 1.0 - amount), simple_shear_stress(one, amount)
-        ])  # fmt: skip
-
-    target = stresses(solid)
-
-    def errors(numbers: FloatArray) -> tuple[float, FloatArray]:
-        onset, width, cap = numbers
-        ratio = stresses(SpringSolid(1.0, added, Stiffening(onset, onset + width, cap), everywhere)) / target
-        # The modulus that makes the sum of (modulus ratio - 1)^2 smallest.
-        shear_modulus = ratio.sum() / (ratio**2).sum()
-        return shear_modulus, shear_modulus * ratio - 1.0
-
-    starts = [(0.01, 0.5 * strain, 3.0), (0.01, strain, 10.0), (0.25 * strain, 0.5 * strain, 10.0)]
-    bounds = ([0.0, 0.02 * strain, 1.0], [strain, 3.0 * strain, TANGENT_CAP_LARGEST])
-    tried = [
-        least_squares(lambda x: errors(x)[1].ravel(), one, bounds=bounds, x_scale=(0.1, 0.1, 10.0)) for one in starts
-    ]
-    found = min(tried, key=lambda one: one.cost)
-    shear_modulus, error = errors(found.x)
-    worst = np.abs(error).max(axis=1)
-    onset, width, cap = found.x.tolist()
-    modulus = 2.0 * (1.0 + poisson_ratio) * float(shear_modulus)
-    return SpringFit(modulus, Stiffening(onset, onset + width, cap), *worst.tolist())
-
-
-def bulk_modulus(shear_modulus: float, poisson_ratio: float) -> float:
-    """K = 2 mu (1 + nu) / (3 (1 - 2 nu)) [Pa]."""
-    return shear_modulus * 2.0 * (1.0 + poisson_ratio) / (3.0 * (1.0 - 2.0 * poisson_ratio))

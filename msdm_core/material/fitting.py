@@ -26,15 +26,12 @@ No published source is known for this fit; `FitReport` says how well it represen
 The factors are those of the homogeneous organ: lesions change the formula's k_e, not s_e, so lesions may differ from
 reset to reset. With an 8x lesion the stiffness of a whole block is within 0.6 % of that of a fit with the lesion in it;
 a disc of 1.5 cells pressed onto the lesion within 1.5 %, single nodes above it within 14 %. The factors stay with the
-mesh object for as long as it lives; `write_fit` keeps them in a file.
+mesh object for as long as it lives.
 """
 
-import hashlib
 import math
-import time
 import warnings
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -93,7 +90,6 @@ class FitReport:
             the mesh is uneven inside.
         factor_smallest: smallest factor on formula (6).
         factor_largest: largest factor on formula (6).
-        duration: what the fit took [s].
     """
 
     residual_before: float
@@ -101,7 +97,6 @@ class FitReport:
     fallback: bool
     factor_smallest: float
     factor_largest: float
-    duration: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +126,7 @@ def spring_fit(mesh: TetMesh) -> SpringFit:
     """
     fit = _FITS.get(mesh)
     if fit is None:
-        fit = keep_fit(mesh, fit_springs(mesh))
-    return fit
-
-
-def keep_fit(mesh: TetMesh, fit: SpringFit) -> SpringFit:
-    """Make `fit` the fit of a mesh, such as one read from a file; returns it."""
-    _FITS[mesh] = fit
+        fit = _FITS[mesh] = fit_springs(mesh)
     return fit
 
 
@@ -154,7 +143,6 @@ def fit_springs(mesh: TetMesh, youngs_modulus: ArrayLike = 1.0) -> SpringFit:
     Raises:
         OrganError: the fit does not converge.
     """
-    started = time.perf_counter()
     modulus = np.broadcast_to(np.asarray(youngs_modulus, dtype=np.float64), (mesh.tet_count,))
     modulus = modulus / modulus.mean()
     share = lloyd_share(mesh, modulus)
@@ -170,8 +158,7 @@ def fit_springs(mesh: TetMesh, youngs_modulus: ArrayLike = 1.0) -> SpringFit:
         factor, tet_factor = np.ones_like(factor), _region_scalars(mesh, share, modulus)
         _warn_of_fallback(after, tet_factor)
     factors = tet_factor if fallback else factor
-    duration = time.perf_counter() - started
-    report = FitReport(before, after, fallback, float(factors.min()), float(factors.max()), duration)
+    report = FitReport(before, after, fallback, float(factors.min()), float(factors.max()))
     factor.setflags(write=False)
     tet_factor.setflags(write=False)
     return SpringFit(factor, tet_factor, report)
@@ -392,39 +379,3 @@ def _conjugate_gradients(matrix: csr_array, right: FloatArray, diagonal: FloatAr
         energy, before = dot(residual, scaled), energy
         direction = scaled + (energy / before) * direction
     return solution
-
-
-def write_fit(path: Path, mesh: TetMesh) -> SpringFit:
-    """Write a mesh's fit, made where it has none yet, with a fingerprint of the mesh; returns it."""
-    fit = spring_fit(mesh)
-    arrays = {"edge_factor": fit.edge_factor, "tet_factor": fit.tet_factor}
-    with path.open("wb") as file:
-        np.savez_compressed(file, fingerprint=_fingerprint(mesh), **arrays, **asdict(fit.report))
-    return fit
-
-
-def read_fit(path: Path, mesh: TetMesh) -> SpringFit:
-    """Read a fit written by `write_fit` and make it the mesh's, so that `stiffness_rule="fitted"` need not fit.
-
-    Raises:
-        OrganError: the file is no such file, or belongs to another mesh.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            table = {name: file[name] for name in file.files}
-        owner = str(table["fingerprint"])
-        report = FitReport(**{name: table[name].item() for name in FitReport.__dataclass_fields__})
-        fit = SpringFit(table["edge_factor"], table["tet_factor"], report)
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise OrganError(f"{path} cannot be read as fitted springs ({error}): make it with write_fit") from None
-    if owner != _fingerprint(mesh):
-        raise OrganError(f"{path} holds springs fitted to another mesh than {mesh!r}: use write_fit on this one")
-    fit.edge_factor.setflags(write=False)
-    fit.tet_factor.setflags(write=False)
-    return keep_fit(mesh, fit)
-
-
-def _fingerprint(mesh: TetMesh) -> str:
-    """SHA-256 of points, tets and regions."""
-    parts = (mesh.points, mesh.tets, mesh.region)
-    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()

@@ -21,7 +21,7 @@ LESION_SHARE_INSIDE = 0.5
 # Largest rate [1/s] and time [s] of damping: beyond any tissue, and no stable step rounds to 0.
 DAMPING_MOST = 1e6
 
-# Smallest radius of a lesion, and largest radius and coordinate [m]: beyond any organ, and quotients do not overflow.
+# Smallest and largest radius of a lesion [m]: beyond any organ, and quotients do not overflow.
 SMALLEST, FARTHEST = 1e-6, 1e6
 
 # Points per tet edge of the barycentric lattice that samples a tet cut by a lesion's surface: 165 points.
@@ -98,16 +98,6 @@ class Damping:
                     f"damping: {name} is {value} {unit}; it must be at least 0 and at most {DAMPING_MOST:g}"
                 )
 
-    def ratio(self, frequency: float) -> float:
-        """Damping ratio zeta = alpha / (2 w) + beta w / 2 of a mode of the given frequency [Hz], w = 2 pi f."""
-        omega = 2.0 * math.pi * frequency
-        return self.alpha / (2.0 * omega) + self.beta * omega / 2.0
-
-    def compressed(self, frequency: float) -> "Damping":
-        """The paper's form, all in one inertial term: alpha' = alpha + beta w^2 damps that mode [Hz] alike."""
-        omega = 2.0 * math.pi * frequency
-        return Damping(alpha=self.alpha + self.beta * omega * omega)
-
 
 @dataclass(frozen=True)
 class Capsule:
@@ -156,26 +146,12 @@ class Lesion:
     region: str | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.material, Material):
-            raise OrganError(
-                f"{self.name}: its material is {self.material!r}; give Lesion(..., material=Material(...))"
-            )
         if self.region is not None:
-            if self.centre is not None or self.radius is not None or self.radii is not None:
-                raise OrganError(f"{self.name}: give either a region or a centre with radius or radii, not both")
             return
         if self.centre is None or (self.radius is None) == (self.radii is None):
             raise OrganError(f"{self.name}: give a centre and either radius or radii, or a mesh region")
-        if self.radius is not None and np.ndim(self.radius) != 0:
-            raise OrganError(
-                f"{self.name}: radius is {self.radius}; it is one number, an ellipsoid takes radii=(a, b, c)"
-            )
         axes = self.half_axes
-        if len(self.centre) != 3 or not (np.abs(self.centre) <= FARTHEST).all():
-            raise OrganError(
-                f"{self.name}: centre is {self.centre}; it must be three finite numbers in metres, up to {FARTHEST:g}"
-            )
-        if axes.shape != (3,) or not ((axes >= SMALLEST) & (axes <= FARTHEST)).all():
+        if not ((axes >= SMALLEST) & (axes <= FARTHEST)).all():
             raise OrganError(f"{self.name}: {self._size_text}; it must be from {SMALLEST:g} to {FARTHEST:g}")
 
     @property
@@ -240,7 +216,7 @@ def tet_samples(corners: FloatArray) -> FloatArray:
 def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: FloatArray) -> None:
     node = int(np.argmin(norm(mesh.points - np.asarray(lesion.centre), axis=1)))
     # The smallest of the tets around: those at an outer face are cut along its diagonal.
-    corners = mesh.points[mesh.tets[mesh.node_tets.of(node)]]
+    corners = mesh.points[mesh.tets[(mesh.tets == node).any(axis=1)]]
     edges = norm(corners[:, TET_EDGES[:, 0]] - corners[:, TET_EDGES[:, 1]], axis=2)
     cell = float(edges.max(axis=1).min())
     if 2.0 * axes.min() < cell:

@@ -1,7 +1,5 @@
 """Spring stiffness from Young's moduli: formula (6) of Sala et al. 2011, fitted, and a membrane."""
 
-from difflib import get_close_matches
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -33,13 +31,10 @@ def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "llo
         edges (n_spring, 2) and stiffness [N/m] (n_spring,), in the order of `mesh.edges`.
 
     Raises:
-        OrganError: an unknown rule (lists the known) or a modulus that is not above 0 (names the tet).
+        OrganError: an unknown rule (lists the known).
     """
     check_stiffness_rule(rule)
     modulus = np.broadcast_to(np.asarray(youngs_modulus, dtype=np.float64), (mesh.tet_count,))
-    bad = np.flatnonzero(~(np.isfinite(modulus) & (modulus > 0.0)))
-    if bad.size:
-        raise OrganError(f"youngs_modulus of tet {bad[0]} is {modulus[bad[0]]} Pa; it must be finite and above 0")
     return mesh.edges, _summed(mesh, modulus, rule)
 
 
@@ -67,11 +62,9 @@ def _summed(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
 
 
 def check_stiffness_rule(rule: str) -> None:
-    """OrganError where a rule is none of STIFFNESS_RULES: lists them and suggests the nearest."""
+    """OrganError where a rule is none of STIFFNESS_RULES: lists them."""
     if rule not in STIFFNESS_RULES:
-        nearest = get_close_matches(str(rule), STIFFNESS_RULES, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise OrganError(f"stiffness rule {rule!r} is unknown; the rules are {', '.join(STIFFNESS_RULES)}{hint}")
+        raise OrganError(f"stiffness rule {rule!r} is unknown; the rules are {', '.join(STIFFNESS_RULES)}")
 
 
 def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -> FloatArray:

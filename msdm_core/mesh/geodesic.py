@@ -70,11 +70,6 @@ class SurfaceDistance:
         return np.where(same, straight, distance)
 
 
-def surface_distance(points: FloatArray, triangles: IntArray, source: ArrayLike, targets: ArrayLike) -> FloatArray:
-    """Distance along a surface from a point (3,) to points (n, 3) [m], shape (n,); see SurfaceDistance."""
-    return SurfaceDistance(points, triangles)(source, targets)
-
-
 def nearest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
     """Barycentric weights of the point of each triangle nearest to a query point [m], shape (n_triangle, 3).
 

@@ -23,13 +23,6 @@ class MeshQuality:
     volume: float  # [m^3]
     volume_error: float | None  # (mesh - surface) / surface; None where no surface was given
 
-    def __str__(self) -> str:
-        fit = "" if self.volume_error is None else f", volume error {self.volume_error:+.2%}"
-        return (
-            f"{self.node_count} nodes, {self.tet_count} tets, dihedral angles {self.dihedral_smallest_deg:.1f} to "
-            f"{self.dihedral_largest_deg:.1f} degrees, radius ratio from {self.radius_ratio_smallest:.3f}{fit}"
-        )
-
 
 def mesh_quality(mesh: TetMesh, surface: tuple[ArrayLike, ArrayLike] | None = None) -> MeshQuality:
     """Measure a mesh.

@@ -104,14 +104,8 @@ def check_surface(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArray
 
 def _checked_arrays(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArray, Int64Array]:
     points, corners = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise MeshError(f"vertices have shape {points.shape}; the rule is (n_vertex, 3), in metres")
     if corners.size == 0:
         raise MeshError("the surface has no triangles; a body needs a closed surface: read or make one first")
-    if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
-        raise MeshError(
-            f"triangles have shape {corners.shape}, dtype {corners.dtype}; the rule is integer (n_triangle, 3)"
-        )
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise MeshError(

@@ -11,7 +11,7 @@ around it are made fine.
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.errors import MeshError
@@ -28,7 +28,6 @@ from msdm_core.meshing.stuffing import (
     lattice_around,
 )
 
-CELLS_ACROSS_MIN = 2
 COARSENINGS = (1, 2, 4)  # largest / smallest cell edge of a lattice, per level of the largest
 
 # Share of an edge within which a node of any but a BCC tet moves onto the surface. On 16 bumpy bodies with randomly
@@ -43,19 +42,8 @@ BESIDE = np.array([step for step in product((-1, 0, 1), repeat=3) if 1 <= np.abs
 RING = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # corners of a face, in turn
 
 
-def checked_coarsest(
-    size: float, coarse_cell_size: float | None, fine_triangles: ArrayLike | None, fine_depth: float
-) -> int:
+def coarsest_level(size: float, coarse_cell_size: float) -> int:
     """The level of the largest cells: 0 for cells of one size, 1 or 2."""
-    if not (np.isfinite(fine_depth) and fine_depth >= 0):
-        raise MeshError(f"fine_depth is {fine_depth}; the rule is a length of 0 or more in metres")
-    if coarse_cell_size is None:
-        if fine_triangles is not None or fine_depth:
-            raise MeshError(
-                "fine_triangles or fine_depth without a coarse_cell_size: all cells would be alike; "
-                f"give a coarse_cell_size of {2 * size:g} or {4 * size:g} m, or leave them out"
-            )
-        return 0
     ratio = coarse_cell_size / size
     for level, coarsening in enumerate(COARSENINGS):
         if abs(ratio - coarsening) <= 1e-9 * coarsening:
@@ -64,39 +52,6 @@ def checked_coarsest(
         f"coarse_cell_size {coarse_cell_size:g} m is {ratio:g} times cell_size {size:g} m; "
         f"the rule is 1, 2 or 4 times: use {2 * size:g} or {4 * size:g} m"
     )
-
-
-def checked_fine_triangles(chosen: ArrayLike | None, triangle_count: int) -> Int64Array:
-    """Indices of the chosen triangles, shape (n_fine,)."""
-    if chosen is None:
-        return np.arange(triangle_count)
-    given = np.asarray(chosen)
-    if given.dtype == bool and given.shape == (triangle_count,):
-        given = np.flatnonzero(given)
-    if not given.size:
-        raise MeshError(
-            "fine_triangles chooses no triangle, so no cell would be fine: choose some (does the approach meet the "
-            "surface?), or leave out coarse_cell_size and use a larger cell_size"
-        )
-    if given.dtype.kind not in "iu" or given.ndim != 1:
-        raise MeshError(
-            f"fine_triangles has shape {given.shape}, dtype {given.dtype}; the rule is a list of triangle indices or "
-            f"one bool per triangle, ({triangle_count},)"
-        )
-    wrong = np.flatnonzero((given < 0) | (given >= triangle_count))
-    if wrong.size:
-        raise MeshError(f"fine_triangles names triangle {given[wrong[0]]}; indices lie in 0..{triangle_count - 1}")
-    return given.astype(np.int64)
-
-
-def check_coarse_cell_size(points: FloatArray, size: float, coarsest: int) -> None:
-    """Refuse coarse cells of which fewer than CELLS_ACROSS_MIN fit across the surface's smallest extent."""
-    coarse, smallest = size * 2**coarsest, np.ptp(points, axis=0).min()
-    if smallest < CELLS_ACROSS_MIN * coarse:
-        raise MeshError(
-            f"coarse_cell_size {coarse:g} m is too coarse: the surface is {smallest:.4g} m across its smallest extent, "
-            f"the rule is at least {CELLS_ACROSS_MIN} cells: use {coarse / 2:g} m, or a smaller cell_size"
-        )
 
 
 def stuff_graded(

@@ -7,7 +7,7 @@ Both can be graded: fine where the tissue is felt, with cells 2 or 4 times as lo
 import warnings
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -17,25 +17,22 @@ from msdm_core.mesh.ordering import swept
 from msdm_core.mesh.surface import Int64Array, check_surface, surface_volume
 from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, tet_volumes
 from msdm_core.meshing.grading import (
-    CELLS_ACROSS_MIN,
     COARSENINGS,
     balanced_levels,
-    check_coarse_cell_size,
-    checked_coarsest,
-    checked_fine_triangles,
+    coarsest_level,
     octree_tets,
     stuff_graded,
 )
 from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
 
 STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
-SIDE_RANGE = (1e-9, 1e9)  # of a block [m], so that nothing overflows
 TETS_PER_CELL = 12
+CELLS_ACROSS_MIN = 2
 TET_LIMIT = 2_000_000
 GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
 
 
-def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float | None = None) -> TetMesh:
+def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float = 0.0) -> TetMesh:
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
     Nodes are the corners and then the centres of the cells. Each inner cell face gives four tets (two centres and
@@ -52,11 +49,9 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
         UserWarning: names the stretch where cells are more than 1 % from cubes: formula (6) is then not isotropic.
 
     Raises:
-        ValueError: names the size or count that is not positive, the coarsening that does not fit the cells or the
-            fine depth that does not fit the block.
+        ValueError: names the size or count that is not positive.
     """
     lengths, counts = _checked_box(size, cells)
-    fine_layers = _checked_fine_layers(lengths, counts, coarsening, fine_depth)
     edges = lengths / counts
     stretch = edges.max() / edges.min()
     if stretch > STRETCH_LIMIT:
@@ -67,6 +62,8 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
             stacklevel=2,
         )
     if coarsening > 1:
+        # Rounding must not add a layer to a depth of whole layers.
+        fine_layers = int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
         return _graded_box(lengths, counts, coarsening, fine_layers)
     corners = np.arange(np.prod(counts + 1)).reshape(counts + 1)
     centres = corners.size + np.arange(np.prod(counts)).reshape(counts)
@@ -79,41 +76,13 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
 
 def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
     lengths, counts = np.asarray(size, dtype=np.float64), np.asarray(cells)
-    shortest, longest = SIDE_RANGE
-    if lengths.shape != (3,) or not ((lengths >= shortest) & (lengths <= longest)).all():
-        raise ValueError(
-            f"size is {lengths.tolist()}; the rule is three positive lengths in metres, {shortest:g} to {longest:g}"
-        )
-    # Numbers that no 64 bits hold make an array of objects.
-    known = counts.shape == (3,) and counts.dtype.kind in "iuf"
-    if not known or not (np.isfinite(counts) & (counts >= 1) & (counts == np.floor(counts))).all():
-        raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1, of 64 bits")
+    if not (lengths > 0.0).all():
+        raise ValueError(f"size is {lengths.tolist()}; the rule is three positive lengths in metres")
+    if not ((counts >= 1) & (counts == np.floor(counts))).all():
+        raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1")
     if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:
         raise ValueError(f"cells is {counts.tolist()}; that is more than {TET_LIMIT} tets: choose fewer cells")
     return lengths, counts.astype(np.int64)
-
-
-def _checked_fine_layers(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_depth: float | None) -> int:
-    """How many layers of cells below the top face are fine."""
-    if coarsening not in COARSENINGS:
-        raise ValueError(f"coarsening is {coarsening}; the rule is 1, 2 or 4")
-    if (coarsening == 1) != (fine_depth is None):
-        raise ValueError(
-            f"coarsening is {coarsening} and fine_depth {fine_depth}: give a fine_depth with a coarsening of 2 or 4, "
-            "and none where all cells are alike"
-        )
-    if (counts % coarsening).any():
-        raise ValueError(
-            f"cells is {counts.tolist()} with coarsening {coarsening}; the rule is multiples of {coarsening}"
-        )
-    if fine_depth is None:
-        return int(counts[2])
-    if not 0 < fine_depth <= lengths[2]:
-        raise ValueError(
-            f"fine_depth is {fine_depth:g} m; the rule is above 0 and at most the height, {lengths[2]:g} m"
-        )
-    # Rounding must not add a layer to a depth of whole layers.
-    return int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
 
 
 def _graded_box(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_layers: int) -> TetMesh:
@@ -147,7 +116,7 @@ def mesh_surface(
     *,
     cell_size: float,
     coarse_cell_size: float | None = None,
-    fine_triangles: ArrayLike | None = None,
+    fine_triangles: NDArray[np.bool_] | None = None,
     fine_depth: float = 0.0,
 ) -> TetMesh:
     """Fill a closed surface with tets of a BCC lattice by isosurface stuffing (Labelle and Shewchuk 2007).
@@ -161,8 +130,8 @@ def mesh_surface(
         triangles: vertex indices, shape (n_triangle, 3); turned outward where needed.
         cell_size: cube edge of the lattice, of its fine cells where it is graded [m].
         coarse_cell_size: edge of the largest cells, 2 or 4 times `cell_size` [m]; left out, all cells are alike.
-        fine_triangles: where the lattice is fine if it is graded: triangle indices or one bool per triangle, such as
-            `triangles_facing` gives; left out, along the whole surface.
+        fine_triangles: where the lattice is fine if it is graded: one bool per triangle, such as `triangles_facing`
+            gives; left out, along the whole surface.
         fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
 
     Warns:
@@ -175,15 +144,16 @@ def mesh_surface(
     size = float(cell_size)
     if not (np.isfinite(size) and size > 0):
         raise MeshError(f"cell_size is {cell_size}; the rule is a positive length in metres")
-    coarsest = checked_coarsest(size, coarse_cell_size, fine_triangles, fine_depth)
+    coarsest = 0 if coarse_cell_size is None else coarsest_level(size, coarse_cell_size)
     points, corners = check_surface(vertices, triangles)
     check_cell_size(np.ptp(points, axis=0), surface_volume(points, corners), size)
     if coarsest:
-        check_coarse_cell_size(points, size, coarsest)
-        fine = checked_fine_triangles(fine_triangles, len(corners))
-        nodes, tets = stuff_graded(
-            SurfaceBody(points, corners), points[corners[fine]], size, float(fine_depth), coarsest
-        )
+        fine = corners if fine_triangles is None else corners[fine_triangles]
+        if not len(fine):
+            raise MeshError(
+                "fine_triangles chooses no triangle, so no cell would be fine: does the approach meet the surface?"
+            )
+        nodes, tets = stuff_graded(SurfaceBody(points, corners), points[fine], size, fine_depth, coarsest)
     else:
         nodes, tets = stuff(SurfaceBody(points, corners), lattice_around(points, size))
     if not len(tets):

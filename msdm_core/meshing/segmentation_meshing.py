@@ -20,8 +20,6 @@ from msdm_core.meshing.grading import COARSENINGS, stuff_graded
 from msdm_core.meshing.lattice_meshing import check_cell_size, largest_body_mesh
 from msdm_core.meshing.stuffing import LevelSetBody, lattice_around, stuff
 
-Names = Mapping[int, str] | Sequence[tuple[int, str]]
-
 # Width of the Gaussian that smooths the voxels' steps, in voxels of the widest spacing and in cells: the larger counts.
 # 0.7 of a spacing leaves 3 % of a step one spacing long (exp(-2 pi^2 0.49) of its first harmonic).
 SMOOTHING_SPACINGS, SMOOTHING_CELLS = 0.7, 0.2
@@ -48,22 +46,18 @@ class RegionShare:
 
 @dataclass(frozen=True, eq=False)
 class FilledLabels:
-    """A label image filled with tets, and the change of its volume.
+    """A label image filled with tets.
 
     Fields:
         mesh: tags are the labels, in metres from the centre of voxel (0, 0, 0).
         label_volume: of the voxels that were filled, the largest part [m^3].
         region_volumes: of the voxels of each label of the mesh [m^3].
-        smoothing: standard deviation of the Gaussian [m].
-        smoothing_change: of the volume by smoothing alone, as a share; the level is moved to make up for it.
         dropped: voxels of the parts that do not hang together with the largest by faces, largest first.
     """
 
     mesh: TetMesh
     label_volume: float
     region_volumes: dict[int, float]
-    smoothing: float
-    smoothing_change: float
     dropped: tuple[int, ...]
 
     @property
@@ -72,15 +66,17 @@ class FilledLabels:
         return float(self.mesh.volumes.sum()) / self.label_volume - 1.0
 
 
-def mesh_segmentation(labels: ArrayLike, spacing: ArrayLike, *, cell_size: float, region_names: Names) -> TetMesh:
+def mesh_segmentation(
+    labels: ArrayLike, spacing: ArrayLike, *, cell_size: float, region_names: Mapping[int, str]
+) -> TetMesh:
     """Fill the named labels of an image with tets of a BCC lattice; tags and names of its regions are the labels'.
 
     Args:
         labels: whole numbers, shape (n_x, n_y, n_z); those without a name are outside.
         spacing: of the voxels along the three axes [m], shape (3,).
         cell_size: cube edge of the lattice [m].
-        region_names: the labels that make up the organ: {1: "liver", 2: "lesion"}, or such pairs; the first has the
-            tets that no other fills.
+        region_names: the labels that make up the organ: {1: "liver", 2: "lesion"}; the first has the tets that no
+            other fills.
 
     Returns:
         The mesh, in metres from the centre of voxel (0, 0, 0) along the image's axes.
@@ -89,8 +85,7 @@ def mesh_segmentation(labels: ArrayLike, spacing: ArrayLike, *, cell_size: float
         UserWarning: says which parts beside the largest were left out, and what `mesh_surface` warns of.
 
     Raises:
-        MeshError: names what is wrong with the image, the spacing, the label that is empty or too small for a tet, or a
-            cell size that would work.
+        MeshError: names the label that is empty or too small for a tet, or a cell size that would work.
     """
     filled = fill_labels(labels, spacing, cell_size=cell_size, region_names=region_names)
     if filled.dropped:
@@ -125,7 +120,7 @@ def fill_labels(
     spacing: ArrayLike,
     *,
     cell_size: float,
-    region_names: Names,
+    region_names: Mapping[int, str],
     fine_face: FineFace | None = None,
 ) -> FilledLabels:
     """`mesh_segmentation`, with the change of volume, and graded where a face is given at which cells are fine.
@@ -134,18 +129,16 @@ def fill_labels(
     removes volume where the surface is convex, and so do the flat faces of tets; the level is moved from 1/2 until the
     mesh has the volume of the voxels.
     """
-    image, step, names = _checked(labels, spacing, cell_size, region_names)
+    image, step, names = _checked(labels, spacing, region_names)
     organ, corner, dropped = largest_part(image, [tag for tag, _ in names])
     inside = image[tuple(slice(low, low + n) for low, n in zip(corner, organ.shape, strict=True))]
     volume = float(np.count_nonzero(organ)) * float(np.prod(step))
-    check_cell_size(_extent(organ, step), volume, cell_size)
+    check_cell_size(np.array(organ.shape) * step, volume, cell_size)
     field = smoothed_share(organ, corner, step, cell_size)
-    mesh, change = _filled_to_volume(field, volume, cell_size, fine_face)
+    mesh = _filled_to_volume(field, volume, cell_size, fine_face)
     inside = np.where(organ, inside, 0)
     region, volumes = _regions(mesh, inside, corner, step, names)
-    return FilledLabels(
-        TetMesh(mesh.points, mesh.tets, region, names), volume, volumes, field.smoothing, change, dropped
-    )
+    return FilledLabels(TetMesh(mesh.points, mesh.tets, region, names), volume, volumes, dropped)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,22 +181,12 @@ class SmoothedShare:
 
 
 def _checked(
-    labels: ArrayLike, spacing: ArrayLike, cell_size: float, region_names: Names
+    labels: ArrayLike, spacing: ArrayLike, region_names: Mapping[int, str]
 ) -> tuple[NDArray, FloatArray, tuple[tuple[int, str], ...]]:
     image, step = np.asarray(labels), np.asarray(spacing, dtype=np.float64)
     if image.ndim != 3:
         raise MeshError(f"the label image has shape {image.shape}; the rule is three axes: choose one volume of it")
-    if image.dtype.kind not in "iub":
-        raise MeshError(f"the label image has dtype {image.dtype}; labels are whole numbers: convert them first")
-    if step.shape != (3,) or not (np.isfinite(step) & (step > 0)).all():
-        raise MeshError(f"spacing is {step.tolist()}; the rule is three positive lengths in metres")
-    if not (np.isfinite(cell_size) and cell_size > 0):
-        raise MeshError(f"cell_size is {cell_size}; the rule is a positive length in metres")
-    pairs = region_names.items() if isinstance(region_names, Mapping) else region_names
-    names = tuple((int(tag), str(name)) for tag, name in pairs)
-    tags = [tag for tag, _ in names]
-    if not names or len(set(tags)) < len(tags) or 0 in tags:
-        raise MeshError(f"region_names are {names}; the rule is one name or more, each of another label, none of 0")
+    names = tuple(region_names.items())
     there = set(np.unique(image).tolist())
     for tag, name in names:
         if tag not in there:
@@ -236,10 +219,6 @@ def parts_of(mask: NDArray[np.bool_], *, corners: bool = False) -> tuple[NDArray
 
     labelled: Any = ndimage.label(mask, structure=np.ones((3, 3, 3)) if corners else None)
     return labelled[0], int(labelled[1])
-
-
-def _extent(organ: NDArray[np.bool_], step: FloatArray) -> FloatArray:
-    return np.array(organ.shape) * step
 
 
 def smoothed_share(
@@ -285,11 +264,8 @@ def smoothed_share(
     return SmoothedShare(values, start, block, smoothing)
 
 
-def _filled_to_volume(
-    field: SmoothedShare, volume: float, cell_size: float, fine_face: FineFace | None
-) -> tuple[TetMesh, float]:
-    """The mesh whose volume is nearest to the wanted one [m^3], and the share by which smoothing alone changed it."""
-    change = field.volume_above(0.5) / volume - 1.0
+def _filled_to_volume(field: SmoothedShare, volume: float, cell_size: float, fine_face: FineFace | None) -> TetMesh:
+    """The mesh whose volume is nearest to the wanted one [m^3]."""
     level, best = 0.5, None
     # Volume lost as the level rises; the secant through the last two meshes takes over.
     slope = (field.volume_above(0.4) - field.volume_above(0.6)) / 0.2
@@ -306,7 +282,7 @@ def _filled_to_volume(
         before = (level, error)
         level = float(np.clip(level + error / slope, *LEVEL_RANGE))
     assert best is not None
-    return best[1], change
+    return best[1]
 
 
 def _mesh_above(field: SmoothedShare, level: float, cell_size: float, fine_face: FineFace | None) -> TetMesh:

@@ -34,7 +34,7 @@ class Organ:
     press_depth: MaybeNumber = None
     """Depth of a press [m]; default: 7/12 of the tip's radius."""
     out: MaybePath = None
-    """File for the mesh (vtu, vtk, msh, mesh)."""
+    """File for the mesh, a .vtu."""
     youngs_modulus: MaybeNumber = None
     """Young's modulus of the healthy tissue [Pa]; default: by the organ's name, else the liver's."""
     modulus: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -93,7 +93,7 @@ class Organ:
                 "STL, a solid of a CAD program too, and tets of another program as vtu (meshio convert IN OUT.vtu)"
             )
         if self.out is not None:
-            patient.check_targets(self.out)
+            patient.check_target(self.out)
         out = self.out or Path("patient.vtu")
         with StepProgress(console) as progress:
             found = patient.make_patient(

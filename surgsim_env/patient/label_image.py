@@ -18,10 +18,6 @@ from surgsim_env.patient.label_readers import ImageGeometry, LabelSource, read_l
 from surgsim_env.patient.materials import check_name, is_lesion
 
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
-# Largest bounding box of the labels [voxels]; meshing makes a few copies of it with four bytes a voxel.
-BOX_VOXELS_MOST = 200_000_000
-LABEL_LARGEST = 2**31 - 1
-LABELS_MOST = 32
 FORM = "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2"
 # A lesion smaller than a ball of half a cell's radius cannot be shown (the rule of
 # `msdm_core.material.regions.Lesion`).
@@ -44,7 +40,7 @@ def parse_labels(text: str) -> tuple[LabelName, ...]:
     """The tissues of a text such as "liver=1,lesion=2", the organ first.
 
     Raises:
-        MeshError: a part that breaks the form, a name or a label given twice, too many labels.
+        MeshError: a part that breaks the form, a name or a label given twice.
     """
     names = []
     for part in text.split(","):
@@ -52,16 +48,14 @@ def parse_labels(text: str) -> tuple[LabelName, ...]:
         name = name.strip()
         if not found or not re.fullmatch(r"\s*\d{1,10}\s*", value):
             raise MeshError(f"--labels: {part!r} is no NAME=LABEL; give {FORM}")
-        if not 1 <= int(value) <= LABEL_LARGEST:
-            raise MeshError(f"--labels: {part!r}: labels are from 1 to {LABEL_LARGEST}, 0 is outside; give {FORM}")
+        if int(value) == 0:
+            raise MeshError(f"--labels: {part!r}: label 0 is outside; give {FORM}")
         names.append(LabelName(check_name(name, "--labels"), int(value)))
     for what in ("name", "value"):
         given = [getattr(one, what) for one in names]
         twice = next((one for one in given if given.count(one) > 1), None)
         if twice is not None:
             raise MeshError(f"--labels: {twice!r} is given twice; each tissue has one label of its own")
-    if len(names) > LABELS_MOST:
-        raise MeshError(f"--labels: {len(names)} labels are given; at most {LABELS_MOST} are taken")
     return tuple(names)
 
 
@@ -100,10 +94,11 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
     """Read the named labels of an image file, which is held as a whole.
 
     Raises:
-        MeshError: a file that is missing or that its library cannot read, sheared, too large or not of three axes;
+        MeshError: a file that is missing or that its library cannot read, sheared or not of three axes;
             values that are not whole numbers; a label that is nowhere in it (lists those that are).
     """
-    _check_there(file)
+    if not file.is_file():
+        raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
     source = read_labels(file, [label.value for label in labels])
     found = np.zeros(source.values.shape, dtype=np.uint8)
     for tag, label in enumerate(labels, start=1):
@@ -117,15 +112,6 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
     return _cut(found, labels, source)
 
 
-def _check_there(file: Path) -> None:
-    if file.is_dir():
-        raise MeshError(f"{file}: is a directory; give the path of a file in it")
-    if not file.is_file():
-        raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
-    if not file.stat().st_size:
-        raise MeshError(f"{file}: is empty (0 bytes); export it again")
-
-
 def _there(source: LabelSource) -> str:
     known = [int(value) for value in np.unique(source.values) if value]
     more = ", ..." if len(known) > 20 else ""
@@ -137,13 +123,6 @@ def _cut(found: NDArray[np.uint8], labels: Sequence[LabelName], source: LabelSou
     for axis in range(3):
         used = np.flatnonzero(found.any(axis=tuple({0, 1, 2} - {axis})))
         box.append(slice(int(used[0]), int(used[-1]) + 1))
-    sides = [one.stop - one.start for one in box]
-    total = float(np.prod(np.array(sides, dtype=np.float64)))
-    if total > BOX_VOXELS_MOST:
-        raise MeshError(
-            f"{source.file}: the labels reach over {' x '.join(map(str, sides))} = {total:.3g} voxels; at most "
-            f"{BOX_VOXELS_MOST:.3g} are worked on: resample the image, voxels of a tenth of a cell are fine enough"
-        )
     x, y, z = (one.start for one in box)
     return LabelImage(
         np.ascontiguousarray(found[tuple(box)]),

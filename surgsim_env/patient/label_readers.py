@@ -20,8 +20,6 @@ COSINE_LARGEST = 1e-3
 # Smallest and largest voxel spacing that is accepted [m].
 SPACING_RANGE = (1e-5, 0.05)
 AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
-# Largest image [voxels]; it is held as a whole.
-VOXELS_MOST = 1_000_000_000
 # NIfTI's axes are RAS: x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
@@ -55,13 +53,9 @@ class ImageGeometry:
             file: for messages.
 
         Raises:
-            MeshError: numbers that are not finite, axes that are not at right angles, a spacing outside SPACING_RANGE.
+            MeshError: axes that are not at right angles, a spacing outside SPACING_RANGE.
         """
-        if not (np.isfinite(matrix).all() and np.isfinite(origin).all()):
-            raise MeshError(f"{file}: the header's affine has numbers that are not finite: export the image again")
-        # Of numbers above 1e154 it is infinite, and refused.
-        with np.errstate(over="ignore"):
-            spacing = norm(matrix, axis=0)
+        spacing = norm(matrix, axis=0)
         low, high = SPACING_RANGE
         if not ((spacing >= low) & (spacing <= high)).all():
             shown = " x ".join(f"{one * 1e3:.4g}" for one in spacing)
@@ -122,7 +116,7 @@ def read_labels(file: Path, wanted: Sequence[int]) -> LabelSource:
         wanted: segment numbers of a DICOM segmentation; where segments overlap, the later one in this list applies.
 
     Raises:
-        MeshError: a file that its library cannot read, an image that is sheared, too large or not of three axes,
+        MeshError: a file that its library cannot read, an image that is sheared or not of three axes,
             voxels that are no whole numbers.
     """
     return parsed(file, lambda _: _read(file, wanted), "export or copy it again")
@@ -145,7 +139,7 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
     """The three voxel counts of a header; further axes of length 1 are dropped.
 
     Raises:
-        MeshError: fewer or more axes, or an image that is too large.
+        MeshError: fewer or more axes.
     """
     counts = [int(count) for count in shape]
     while len(counts) > 3 and counts[-1] == 1:
@@ -154,14 +148,6 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
         text = " x ".join(map(str, counts))
         raise MeshError(
             f"{file}: the image has {len(counts)} axes ({text}); the rule is three: export one volume of it"
-        )
-    if min(counts) < 1:
-        raise MeshError(f"{file}: the image has {' x '.join(map(str, counts))} voxels: export it again")
-    total = counts[0] * counts[1] * counts[2]
-    if total > VOXELS_MOST:
-        raise MeshError(
-            f"{file}: the image has {' x '.join(map(str, counts))} = {total:.3g} voxels; at most {VOXELS_MOST:.3g} are "
-            "read: crop it to the organ, or resample it"
         )
     return counts[0], counts[1], counts[2]
 

@@ -60,7 +60,11 @@ def lack_of_room(sample: FaceSample, draw: LesionDraw) -> str:
         allowed = sample.thick & (sample.rim >= ranges.rim_distance)
         fitting = _centres(sample, allowed, ranges.radius[1], ranges.cover[1])
         if len(fitting) < SHARE_LEAST * POINTS:
-            return _too_few(sample, allowed, len(fitting), ranges)
+            return (
+                f"a ball of {ranges.radius[1] * 1e3:.3g} mm radius under {ranges.cover[1] * 1e3:.3g} mm of tissue fits "
+                f"below {len(fitting)} of {POINTS} points of the palpable face; "
+                f"{math.ceil(SHARE_LEAST * POINTS)} are needed"
+            )
         if count > 1:
             radius, cover = float(np.mean(ranges.radius)), float(np.mean(ranges.cover))
             centres = _centres(sample, allowed, radius, cover)
@@ -77,22 +81,6 @@ def _centres(sample: FaceSample, allowed: np.ndarray, radius: float, cover: floa
     """Centres of balls under some tissue [m] below the allowed points where they fit (n, 3)."""
     centres = sample.anatomy.centres_below(sample.points[allowed], sample.normals[allowed], radius + cover)
     return centres[np.isfinite(centres).all(axis=1)]
-
-
-def _too_few(sample: FaceSample, allowed: np.ndarray, fitting: int, ranges: LesionDraw) -> str:
-    """Where the largest lesion does not fit, and why."""
-    radius, cover, rim = ranges.radius[1], ranges.cover[1], ranges.rim_distance
-    thin, border = int((~sample.thick).sum()), int((sample.thick & ~allowed).sum())
-    reasons = {
-        f"over less than {sample.anatomy.face.thickness_smallest * 1e3:.3g} mm of organ": thin,
-        f"nearer than {rim * 1e3:.3g} mm to the border of the palpable face": border,
-        "where another side of the organ or a strong curve leaves less cover": int(allowed.sum()) - fitting,
-    }
-    said = ", ".join(f"{number} lie {where}" for where, number in reasons.items() if number)
-    return (
-        f"a ball of {radius * 1e3:.3g} mm radius under {cover * 1e3:.3g} mm of tissue fits below {fitting} of {POINTS} "
-        f"points of the palpable face; {math.ceil(SHARE_LEAST * POINTS)} are needed ({said})"
-    )
 
 
 def _placed(centres: FloatArray, count: int, apart: float) -> int:

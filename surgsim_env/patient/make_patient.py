@@ -10,7 +10,6 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from msdm_core.mesh.quality import mesh_quality
 from msdm_core.mesh_files.mesh_file import LengthUnit
 from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
 from surgsim_env.palpation.chart import healthy_file, write_healthy_map
@@ -41,7 +40,7 @@ from surgsim_env.patient.patient_scene import (
     approach_of,
     patient_scene,
 )
-from surgsim_env.patient.report import MARK, report_page
+from surgsim_env.patient.report import report_page
 from surgsim_env.patient.retract_scene import BED_GAP, BED_INSIDE, MODULUS_SPREAD, RetractScene, find_retraction
 from surgsim_env.patient.tet_files import PatientTets, patient_of_tets, read_tets, surfaces_of_tets
 from surgsim_env.patient.touch import plan_text, plan_touch
@@ -56,8 +55,6 @@ from surgsim_env.scene.save import scene_toml
 MESHERS = ("lattice", "tetwild")
 REPORT_NAME = "report.html"
 SCENE_MARK = "Made by surgsim from a patient's organ."
-# A file with this first line was written by an earlier run and may be replaced.
-FIRST_LINE = f"# {SCENE_MARK}"
 
 
 def make_patient(
@@ -219,13 +216,10 @@ def write_patient(
         UserWarning: says why there is no healthy map.
     """
     turned = _retract_file(out)
-    lifted = turned.with_suffix(".toml")
-    # Left by an earlier run for an organ that is now replaced.
-    older = [turned.name, lifted.name] if lifted.exists() and _begins(lifted, FIRST_LINE) else []
     healthy = healthy_file(out.with_suffix(".toml")).name
-    others = (healthy, surface_file(out).name, surface_file(turned).name)
-    older += [name for name in others if (out.parent / name).exists()]
-    with output_folder(out.parent, older) as files:
+    # Those of an earlier run may be of an organ that is now replaced.
+    optional = [turned, turned.with_suffix(".toml"), surface_file(out), surface_file(turned)]
+    with output_folder(out.parent, [healthy, *(one.name for one in optional)]) as files:
         with progress.step("drawing the report"):
             names = _write_organ(found, files, out.name, command, retraction)
         if healthy_map and found.scene.lesion is not None:
@@ -279,52 +273,26 @@ def _retract_file(out: Path) -> Path:
     return out.with_name(f"{out.stem}_retract{out.suffix}")
 
 
-def check_targets(out: Path) -> None:
-    """Refuse, before the work, targets that cannot be written and files that no earlier run has written."""
-    check_target(out)
-    turned = _retract_file(out)
-    scene, others = turned.with_suffix(".toml"), "choose another place or remove it"
-    foreign = [turned] if turned.exists() and not scene.exists() else []
-    for own, its_scene in ((out, out.with_suffix(".toml")), (turned, scene)):
-        foreign += [surface_file(own)] if surface_file(own).exists() and not its_scene.exists() else []
-    for path, mark in ((out.with_suffix(".toml"), FIRST_LINE), (scene, FIRST_LINE), (out.with_name(REPORT_NAME), MARK)):
-        if path.is_dir():
-            raise ValueError(f"--out {out}: {path.name} is a folder there; {others}")
-        foreign += [path] if path.exists() and not _begins(path, mark) else []
-    if foreign:
-        raise ValueError(f"--out {out}: {foreign[0]} is there, and not of an earlier run; {others}")
-
-
 def check_target(out: Path) -> None:
     """Refuse, before the work, a mesh file in an unknown format or below what is no folder."""
-    from msdm_core.mesh_files.mesh_io import FORMATS
+    from msdm_core.mesh_files.mesh_io import WRITTEN_SUFFIX
 
-    if out.suffix.lower() not in FORMATS:
-        raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; known: {', '.join(FORMATS)}")
+    if out.suffix.lower() != WRITTEN_SUFFIX:
+        raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; meshes are written as {WRITTEN_SUFFIX}")
     place = next(one for one in out.absolute().parents if one.exists())
     if not (place.is_dir() and os.access(place, os.W_OK)):
         raise ValueError(f"--out {out}: {place} is no folder that you may write to; choose another place")
 
 
-def _begins(path: Path, mark: str) -> bool:
-    with path.open(encoding="utf-8", errors="replace") as stream:
-        return stream.read(len(mark)) == mark
-
-
 def print_patient(found: PatientScene, console: Console) -> None:
     """Print a summary of a patient's organ, and warn of what was dropped, repaired or is unusual."""
     patient, scene, cell = found.patient, found.scene, found.anatomy.palpable_cell
-    mesh, material, title = patient.mesh, scene.material, ", ".join(patient.sources)
-    organ, quality = found.anatomy.organ(found.anatomy.demonstration_lesions()), mesh_quality(mesh)
+    title = ", ".join(patient.sources)
     touch = (scene.instrument.tip_radius, scene.palpation.press_depth)
-    x, y, z = (mesh.points.max(axis=0) - mesh.points.min(axis=0)) * 1e3
-    step = f"{organ.stable_step * 1e3:.3f} ms"
     rows = {
-        "extent": f"{x:.1f} x {y:.1f} x {z:.1f} mm",
-        "nodes": f"{mesh.node_count}",
-        "tets": f"{mesh.tet_count}, {mesh.reoriented_count} reoriented",
-        "springs": f"{len(organ.spring_nodes)}",
-        "volume": f"{quality.volume * 1e6:.1f} ml (error {patient.volume_error:+.2%})",
+        "nodes": f"{patient.mesh.node_count}",
+        "tets": f"{patient.mesh.tet_count}",
+        "volume": f"{patient.volumes[0].mesh * 1e6:.1f} ml (error {patient.volume_error:+.2%})",
     }
     if patient.surface is not None:
         rows["drawn surface"] = patient.surface.text
@@ -333,13 +301,7 @@ def print_patient(found: PatientScene, console: Console) -> None:
     for one in patient.volumes[1:]:
         modulus = found.regions[one.name].material.youngs_modulus
         rows[one.name] = f"{one.mesh * 1e6:.2f} ml (error {one.error:+.2%}), E {modulus:g} Pa"
-    rows |= {
-        "mass": f"{organ.node_mass.sum():.4f} kg at {material.density:g} kg/m^3",
-        "dihedral angles": f"{quality.dihedral_smallest_deg:.1f} to {quality.dihedral_largest_deg:.1f} degrees",
-        "radius ratio": f"from {quality.radius_ratio_smallest:.3f} (1 is regular)",
-        "cell / contact radius": share_text(cell, *touch),
-        "stable step": f"{step} at E {material.youngs_modulus:g} Pa, nu {material.poisson_ratio:g}",
-    }
+    rows["cell / contact radius"] = share_text(cell, *touch)
     table = Table(title=title, show_header=False)
     for name, value in rows.items():
         table.add_row(name, value)
@@ -359,7 +321,7 @@ def scene_text(found: PatientScene) -> str:
         f"From {', '.join(patient.sources)}.",
         f"Mesh: {patient.mesher}, {patient.cells_text}.",
         f"Axes: {patient.convention}.",
-        "Change any number here; surgsim organ replaces this file only while its first line is unchanged.",
+        "Change any number here; surgsim organ replaces this file when it is run again with the same --out.",
         *(f"Note: {note}" for note in (*patient.notes, *found.notes)),
     )
     comments = {

@@ -88,8 +88,6 @@ class PatientMesh:
         convention: the meaning of its axes, in words
         sources: names of the files
         is_scan: whether the axes are the patient's (LPS)
-        smoothing, smoothing_change: width of the labels' smoothing [m] and relative change of the volume by it; None
-            for surfaces
         surface: of the scan, for pictures; None where the mesh's boundary is all there is
         notes: remarks on what was dropped, repaired or is unusual
     """
@@ -104,8 +102,6 @@ class PatientMesh:
     sources: tuple[str, ...]
     notes: tuple[str, ...]
     is_scan: bool
-    smoothing: float | None = None
-    smoothing_change: float | None = None
     surface: SurfaceFit | None = None
 
     @property
@@ -189,17 +185,15 @@ def _mesh_labels(
 ) -> PatientMesh:
     labels = clean_labels(image, cell_size=cell_size, mend=mend)
     if mesher == "tetwild":
-        placed, volumes, smoothed = _conforming(labels, cell_size)
+        placed, volumes = _conforming(labels, cell_size)
         whole = math.fsum(volumes.values())
-        smoothing, change = smoothed.smoothing, smoothed.volume_above(0.5) / whole - 1.0
     else:
-        names = list(enumerate(labels.names, start=1))
+        names = dict(enumerate(labels.names, start=1))
         fine = _fine_face(cells, image.geometry.direction)
         filled = fill_labels(
             labels.tags, image.geometry.spacing, cell_size=cell_size, region_names=names, fine_face=fine
         )
         placed, volumes, whole = filled.mesh, filled.region_volumes, filled.label_volume
-        smoothing, change = filled.smoothing, filled.smoothing_change
     mesh = TetMesh(image.geometry.places(placed.points), placed.tets, placed.region, placed.region_names)
     return PatientMesh(
         mesh=mesh,
@@ -212,8 +206,6 @@ def _mesh_labels(
         sources=(source,),
         notes=(*image.notes, *labels.notes),
         is_scan=True,
-        smoothing=smoothing,
-        smoothing_change=change,
     )
 
 
@@ -295,7 +287,6 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
 
     def make(cell_size: float) -> PatientMesh:
         notes = list(given.notes)
-        smoothing = change = None
         if isinstance(organ, BrokenSurface):
             tags, step, start, note = mended_voxels(organ, cell_size)
             notes.append(note)
@@ -303,7 +294,7 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
             filled = fill_labels(tags, step, cell_size=cell_size, region_names={1: organ.name}, fine_face=fine)
             notes += [f"{len(filled.dropped)} part(s) apart from the largest were left out"] if filled.dropped else []
             plain = TetMesh(filled.mesh.points + start, filled.mesh.tets)
-            volume, smoothing, change = filled.label_volume, filled.smoothing, filled.smoothing_change
+            volume = filled.label_volume
         elif mesher == "tetwild":
             plain, volume = tetwild_mesh([organ, *inner], cell_size), organ.volume
         else:
@@ -324,8 +315,6 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
             sources=given.sources,
             notes=tuple(notes),
             is_scan=False,
-            smoothing=smoothing,
-            smoothing_change=change,
         )
 
     return well_shaped(make, cells)
@@ -409,8 +398,8 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
     return TetMesh(body.points, body.tets, tags, tuple((n, one.name) for n, one in enumerate(surfaces, start=1)))
 
 
-def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[int, float], SmoothedShare]:
-    """Tets inside level sets of the smoothed labels, the labels' volumes by tag [m^3], and the smoothed organ."""
+def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[int, float]]:
+    """Tets inside level sets of the smoothed labels, and the labels' volumes by tag [m^3]."""
     tags, voxel = range(1, len(labels.names) + 1), labels.image.voxel_volume
     volumes = {tag: float(np.count_nonzero(labels.tags == tag)) * voxel for tag in tags}
     organ = _smoothed(labels, 1, cell_size)
@@ -418,7 +407,7 @@ def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[in
     for tag in tags[1:]:
         surface = _level_surface(_smoothed(labels, tag, cell_size), volumes[tag])
         surfaces.append(ClosedSurface(labels.names[tag - 1], *surface))
-    return tetwild_mesh(surfaces, cell_size), volumes, organ
+    return tetwild_mesh(surfaces, cell_size), volumes
 
 
 def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:

@@ -9,7 +9,7 @@ import numpy as np
 
 from msdm_core.arithmetic import matmul
 from msdm_core.material.regions import Lesion, lesion_extent
-from msdm_core.mesh.quality import dihedral_angles, mesh_quality, radius_ratios
+from msdm_core.mesh.quality import mesh_quality
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from msdm_core.organ.compile import compile_organ
 from msdm_core.organ.stability import stable_dt
@@ -19,16 +19,14 @@ from surgsim_env.patient.patient_scene import PatientScene
 from surgsim_env.patient.retract_scene import RetractScene, told
 from surgsim_env.patient.supports import held_text
 from surgsim_env.rendering.tissue import cut_edges
-from surgsim_env.reports.html_page import Picture, page_start, render_page
+from surgsim_env.reports.html_page import Picture, render_page
 from surgsim_env.scene.palpable_surface import hertz_force, hidden_text, share_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Identifies the report of an earlier run, which may be replaced.
 GENERATOR = "surgsim organ"
-MARK = page_start(GENERATOR)
 VOLUME_ERROR_LARGEST = 0.02
 
 # Cells of a table, the first of which names the row.
@@ -39,7 +37,6 @@ HELD = np.array([0.42, 0.47, 0.56])
 SECTION = np.array([0.90, 0.70, 0.62])
 # Colours of the regions after the first, repeated cyclically.
 REGIONS = np.array([[0.95, 0.78, 0.18], [0.25, 0.55, 0.85], [0.35, 0.70, 0.45], [0.62, 0.42, 0.75], [0.92, 0.50, 0.20]])
-BLUE = "#3b6ea8"
 # Views: direction, upward direction, and titles for the axes of a scan and for other axes.
 SIDES = (
     ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), "from the front", "along y"),
@@ -64,7 +61,6 @@ def report_page(
         "Top: the whole organ; bottom: cut open through the middle of its largest region, without the part nearer to "
         "the viewer. Lighter: the face that the probe can press; grey: held, fixed or on fat and ligaments."
     )
-    quality = "Quality of the tets; counts are logarithmic."
     return render_page(
         "organ.html.j2",
         generator=GENERATOR,
@@ -75,7 +71,6 @@ def report_page(
         volumes=_volumes(found),
         organ_picture=Picture("From three sides", outside, organ_picture(found)),
         mesh=_mesh(found),
-        quality_picture=Picture("Tets", quality, quality_picture(found.patient.mesh)),
         regions=_regions(found),
         step=_step(found),
         palpation=_palpation(found),
@@ -107,17 +102,11 @@ def verdict(found: PatientScene) -> str:
 
 def _source(found: PatientScene) -> Rows:
     patient = found.patient
-    rows: Rows = [
+    return [
         ("files", ", ".join(patient.sources)),
         ("axes", patient.convention),
         ("mesher", f"{patient.mesher}, {patient.cells_text}"),
     ]
-    if patient.smoothing is not None and patient.smoothing_change is not None:
-        change = (
-            f"by itself it changed the volume by {patient.smoothing_change:+.2%}, which a shift of the level corrects"
-        )
-        rows.append(("smoothing", f"Gaussian of {patient.smoothing * 1e3:.3g} mm; {change}"))
-    return rows
 
 
 def _volumes(found: PatientScene) -> Rows:
@@ -203,29 +192,6 @@ def organ_picture(found: PatientScene) -> bytes:
         one.set_axis_off()
     _scale_bar(axes[0, 0], mesh)
     _legend(figure, found)
-    return _png(figure)
-
-
-def quality_picture(mesh: TetMesh) -> bytes:
-    """PNG: histograms of the tets' dihedral angles, radius ratios and volumes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 3.2), dpi=100, facecolor=PAPER, layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    angles = dihedral_angles(mesh).ravel()
-    left.hist(angles, bins=np.arange(0.0, 181.0, 4.0), color=BLUE)
-    left.set_xlabel(f"dihedral angle [degrees], {angles.min():.1f} to {angles.max():.1f}")
-    ratios = radius_ratios(mesh)
-    middle.hist(ratios, bins=np.linspace(0.0, 1.0, 41), color=BLUE)
-    middle.set_xlabel(f"radius ratio, from {ratios.min():.2f}; 1 is regular")
-    volumes = mesh.volumes * 1e9
-    # From 0: the tets of a block may all be alike.
-    right.hist(volumes, bins=np.linspace(0.0, 1.001 * volumes.max(), 41), color=BLUE)
-    right.set_xlabel(f"volume [mm³], from {volumes.min():.2g}")
-    for one, what in ((left, "angles"), (middle, "tets"), (right, "tets")):
-        one.set_ylabel(f"number of {what}")
-        one.set_yscale("log")
-        one.spines[["top", "right"]].set_visible(False)
     return _png(figure)
 
 

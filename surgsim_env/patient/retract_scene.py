@@ -102,27 +102,20 @@ class Rim:
     stiffness: float
 
 
-@dataclass(frozen=True)
-class NoRim:
-    """An organ without an edge to be lifted; `thickness` is the opening that its thinnest one needs [m]."""
-
-    thickness: float
-
-    @property
-    def reason(self) -> str:
-        """The reason why the organ cannot be retracted, in a sentence."""
-        jaw = f"the jaw opens {JAW_OPENING * 1e3:g} mm and needs {JAW_PLAY * 1e3:g} mm of play"
-        if self.thickness <= JAW_OPENING - JAW_PLAY:
-            return (
-                f"an edge of {self.thickness * 1e3:.0f} mm fits the jaw ({jaw}), but none has an even side of "
-                f"{np.ptp(ALONG) * 1e3:.0f} x {np.ptp(HIDING) * 1e3:.0f} mm behind it that could hide something"
-            )
-        if math.isinf(self.thickness):
-            return f"this organ has no edge that is straight over the jaw's {PAD_WIDTH * 1e3:g} mm; {jaw}"
+def _no_rim(thickness: float) -> str:
+    """The reason why an organ has no edge to be lifted, from the opening that its thinnest one needs [m]."""
+    jaw = f"the jaw opens {JAW_OPENING * 1e3:g} mm and needs {JAW_PLAY * 1e3:g} mm of play"
+    if thickness <= JAW_OPENING - JAW_PLAY:
         return (
-            f"no edge is thin enough to be grasped {OVERLAP_LEAST * 1e3:g} mm deep: the thinnest is "
-            f"{self.thickness * 1e3:.0f} mm thick, {jaw}"
+            f"an edge of {thickness * 1e3:.0f} mm fits the jaw ({jaw}), but none has an even side of "
+            f"{np.ptp(ALONG) * 1e3:.0f} x {np.ptp(HIDING) * 1e3:.0f} mm behind it that could hide something"
         )
+    if math.isinf(thickness):
+        return f"this organ has no edge that is straight over the jaw's {PAD_WIDTH * 1e3:g} mm; {jaw}"
+    return (
+        f"no edge is thin enough to be grasped {OVERLAP_LEAST * 1e3:g} mm deep: the thinnest is "
+        f"{thickness * 1e3:.0f} mm thick, {jaw}"
+    )
 
 
 class OrganVoxels:
@@ -190,8 +183,11 @@ class OrganVoxels:
         return bottom, top
 
 
-def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | NoRim:
-    """The most flexible edge of an organ that fits into a jaw, with z on the side of `up` (3,) if possible."""
+def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | str:
+    """The most flexible edge of an organ that fits into a jaw, with z on the side of `up` (3,) if possible.
+
+    If there is none, the reason in a sentence.
+    """
     voxels, thinnest, found = OrganVoxels(mesh, VOXEL), math.inf, list[Rim]()
     for place, frame in _edges(mesh, voxels, up):
         thickness = _thickness(voxels, place, frame)
@@ -201,7 +197,7 @@ def find_rim(mesh: TetMesh, up: FloatArray) -> Rim | NoRim:
         sides = (_rim(voxels, place, side, thickness) for side in (frame, frame * [-1.0, 1.0, -1.0]))
         found += [rim for rim in sides if rim is not None]
     if not found:
-        return NoRim(thinnest)
+        return _no_rim(thinnest)
     upright = [rim for rim in found if matmul(rim.frame[:, 2], up) >= float(cos(TURN_MOST))]
     return min(upright or found, key=lambda rim: rim.stiffness)
 
@@ -288,8 +284,8 @@ def find_retraction(found: PatientScene, out: Path) -> RetractScene | str:
     if cell > CELL_MOST:
         return _too_coarse(cell)
     rim = find_rim(mesh, -np.array(found.scene.instrument.approach))
-    if isinstance(rim, NoRim):
-        return rim.reason
+    if isinstance(rim, str):
+        return rim
     # Cells may be coarse away from the face that the probe presses.
     triangles = mesh.boundary_triangles
     near = norm(mesh.points[triangles].mean(axis=1) - rim.place, axis=1) < FLAP_DEPTH

@@ -18,7 +18,6 @@ from surgsim_env.patient.materials import check_name, is_lesion
 Triangles = NDArray[np.int64]
 # Voxels along one cell when a surface is rebuilt.
 MENDING_VOXELS = 6
-VOXELS_MOST = 150_000_000
 # Shift of the grid [voxels], so that no line runs through a vertex or along an edge of an aligned surface.
 SHIFT = 1e-6 * np.array([np.sqrt(2) - 1, np.sqrt(3) - 1, np.sqrt(5) - 2])
 
@@ -151,11 +150,6 @@ def voxels_inside(
     """
     first = np.floor(vertices.min(axis=0) / step).astype(np.int64) - 1
     shape = np.ceil(vertices.max(axis=0) / step).astype(np.int64) + 2 - first
-    if np.prod(shape.astype(np.float64)) > VOXELS_MOST:
-        raise MeshError(
-            f"the surface's box has {np.prod(shape.astype(np.float64)):.3g} voxels of {step:.3g} m; at most "
-            f"{VOXELS_MOST:.3g} are made: use larger cells"
-        )
     places = vertices / step - first + SHIFT
     if not vote:
         winding, _ = _winding(places, triangles, 0, shape)

@@ -49,11 +49,6 @@ def render_page(template: str, *, generator: str = "surgsim", **values: Any) -> 
     return _templates().get_template(template).render(generator=generator, policy=POLICY, **values)
 
 
-def page_start(generator: str) -> str:
-    """The text with which every page of a generator begins: a program recognises its own pages by it."""
-    return _templates().get_template("start.html.j2").render(generator=generator)
-
-
 @cache
 def _templates() -> Environment:
     return Environment(

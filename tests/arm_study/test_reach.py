@@ -12,10 +12,10 @@ from surgsim_env.arm_study.ports import EndoscopePort, PortPlace, Ports, Wall
 from surgsim_env.arm_study.reach import ARM_DISTANCE, Sites, evaluate_both, evaluate_reach, tip_ball
 from surgsim_env.arm_study.results import REASONS, Touch
 from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.instruments.arm.psm import PSM_LINKS, shaft_depth
 from surgsim_env.scene.model import Port
 from tests.arm_study.pivot_arm import RADIUS, SITE, TABLE, pivot, pivot_excess, write_pivot
 from tests.instruments.joints import random_joints
+from tests.instruments.psm_table import PSM_LINKS, shaft_depth
 
 DOWN = (0.0, 0.0, -1.0)
 

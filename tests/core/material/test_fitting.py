@@ -132,7 +132,7 @@ def averages(mesh: TetMesh, force: NDArray) -> NDArray:
 
 def node_weights(mesh: TetMesh) -> NDArray:
     """V^(-2/3) of the mean volume of the tets around each node, (n_node, 1)."""
-    around = [mesh.volumes[mesh.node_tets.of(node)].mean() for node in range(mesh.node_count)]
+    around = [mesh.volumes[(mesh.tets == node).any(axis=1)].mean() for node in range(mesh.node_count)]
     return (np.array(around) ** (-2.0 / 3.0))[:, None]
 
 

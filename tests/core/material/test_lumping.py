@@ -10,7 +10,6 @@ from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
 from msdm_core.material.lumping import lump_mass, voronoi_fractions
-from msdm_core.mesh.tet_mesh import TetMesh
 
 ONE = np.array([[0, 1, 2, 3]])
 REGULAR_HEIGHT = np.sqrt(2 / 3)
@@ -154,14 +153,3 @@ def test_each_scheme_gathers_its_shares_from_the_tets_of_a_node(random_mesh):
         cells[corners] += density[tet] * mesh.volumes[tet] * hull_fractions(mesh.points[corners] * 100)
     np.testing.assert_allclose(lump_mass(mesh, density, scheme="barycentric"), quarters, rtol=1e-12)
     np.testing.assert_allclose(lump_mass(mesh, density, scheme="voronoi"), cells, rtol=1e-7)
-
-
-MESH = TetMesh(np.vstack([np.zeros(3), np.eye(3), np.ones(3)]), [[0, 1, 2, 3], [1, 2, 3, 4]])
-
-
-@pytest.mark.parametrize(
-    ("density", "named"), [(-1060, "-1060"), ([1060, np.nan], "tet 1 .*nan"), ([1060] * 3, r"\(3,\)"), (True, "bool")]
-)
-def test_a_density_that_no_tissue_has_is_refused(density, named):
-    with pytest.raises(ValueError, match=named):
-        lump_mass(MESH, density, scheme="barycentric")

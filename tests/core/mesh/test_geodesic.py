@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from msdm_core.mesh.geodesic import NearestTriangle, nearest_weights, surface_distance
+from msdm_core.mesh.geodesic import NearestTriangle, SurfaceDistance, nearest_weights
 from msdm_core.meshing.lattice_meshing import box_mesh
 
 # Paths between Steiner points are never shorter than the geodesic and, over several triangles, at most 2 % longer.
@@ -16,7 +16,7 @@ def test_on_a_flat_face_it_is_the_straight_line():
     rng = np.random.default_rng(0)
     targets = np.column_stack([rng.random((60, 2)) * 0.06, np.full(60, 0.03)])
     source = np.array([0.0312, 0.0287, 0.03])
-    ratio = surface_distance(mesh.points, mesh.boundary_triangles, source, targets)
+    ratio = SurfaceDistance(mesh.points, mesh.boundary_triangles)(source, targets)
     ratio /= np.linalg.norm(targets - source, axis=1)
     assert ratio.min() >= 1.0 - 1e-9
     assert ratio.max() <= LONGEST
@@ -24,7 +24,7 @@ def test_on_a_flat_face_it_is_the_straight_line():
 
 def test_over_an_edge_it_is_the_unfolded_line():
     mesh = box_mesh((0.06, 0.06, 0.03), (12, 12, 6))
-    distance = surface_distance(mesh.points, mesh.boundary_triangles, [0.02, 0.055, 0.03], [[0.03, 0.06, 0.022]])[0]
+    distance = SurfaceDistance(mesh.points, mesh.boundary_triangles)([0.02, 0.055, 0.03], [[0.03, 0.06, 0.022]])[0]
     unfolded = np.hypot(0.01, 0.005 + 0.008)
     assert unfolded <= distance <= LONGEST * unfolded
 
@@ -34,19 +34,19 @@ def test_on_a_sphere_it_is_the_great_circle():
     points = np.array(sphere.vertices)
     targets = points[1::40]
     angle = np.arccos(np.clip(targets @ points[0] / 0.05**2, -1.0, 1.0))
-    ratio = surface_distance(points, np.array(sphere.faces), points[0], targets) / (0.05 * angle)
+    ratio = SurfaceDistance(points, np.array(sphere.faces))(points[0], targets) / (0.05 * angle)
     assert 0.99 <= ratio.min() and ratio.max() <= LONGEST  # facets cut the corner by less than 1 %
 
 
 def test_the_other_side_of_a_thin_plate_is_far():
     mesh = box_mesh((0.06, 0.06, 0.002), (30, 30, 1))
-    distance = surface_distance(mesh.points, mesh.boundary_triangles, [0.03, 0.03, 0.002], [[0.03, 0.03, 0.0]])[0]
+    distance = SurfaceDistance(mesh.points, mesh.boundary_triangles)([0.03, 0.03, 0.002], [[0.03, 0.03, 0.0]])[0]
     assert 0.06 <= distance <= LONGEST * 0.062
 
 
 def test_same_point_is_zero_away():
     mesh = box_mesh((0.06, 0.06, 0.03), (6, 6, 3))
-    assert surface_distance(mesh.points, mesh.boundary_triangles, [0.02, 0.02, 0.03], [[0.02, 0.02, 0.03]])[0] == 0.0
+    assert SurfaceDistance(mesh.points, mesh.boundary_triangles)([0.02, 0.02, 0.03], [[0.02, 0.02, 0.03]])[0] == 0.0
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.002, 0.2])

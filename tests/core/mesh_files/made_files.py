@@ -2,10 +2,7 @@
 
 import meshio
 import numpy as np
-import pytest
 
-FORMATS = [("a.vtu", None), ("a.vtk", None), ("a.msh", None), ("a.msh", "gmsh22"), ("a.mesh", None)]
-every_format = pytest.mark.parametrize(("name", "file_format"), FORMATS)
 POINTS = np.array([[0.0, 0, 0], [100, 0, 0], [0, 100, 0], [0, 0, 100], [100, 100, 100]])
 TETS = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
 

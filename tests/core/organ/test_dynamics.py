@@ -136,14 +136,6 @@ def test_beta_damps_with_half_beta_omega():
     assert decay_rate(oscillation(model, dt, 5000), dt) == pytest.approx(beta * omega**2 / 2.0, rel=0.01)
 
 
-def test_compressed_damping_damps_the_mode_alike():
-    """alpha' = alpha + beta w^2 has the ratio alpha / (2 w) + beta w / 2 at its frequency w / (2 pi)."""
-    damping = Damping(alpha=3.0, beta=1e-3)
-    assert damping.ratio(10.0) == pytest.approx(3.0 / (40.0 * math.pi) + 0.5e-3 * 20.0 * math.pi, rel=EXACT)
-    assert damping.compressed(10.0).beta == 0.0
-    assert damping.compressed(10.0).ratio(10.0) == pytest.approx(damping.ratio(10.0), rel=EXACT)
-
-
 # ---- conservation -------------------------------------------------------------------------------------------------
 
 

@@ -1,8 +1,7 @@
 """Closed-form kinematics of the patient-side manipulator (PSM) of the da Vinci research kit, from one table.
 
 The numbers are those of jhu-dvrk/sawIntuitiveResearchKit, share/arm/psm.json and
-share/tool/LARGE_NEEDLE_DRIVER_400006.json. `scenes/instruments/make_psm.py` draws the MuJoCo models from this table,
-and the tests compare MuJoCo's kinematics with these equations.
+share/tool/LARGE_NEEDLE_DRIVER_400006.json.
 """
 
 import math
@@ -29,7 +28,6 @@ class Link:
         d: offset along z at joint value 0 [m].
         prismatic: whether the joint adds to d and not to theta.
         lower, upper: limits of the joint [rad, or m where it is prismatic].
-        effort: largest torque [N m] or force [N] of its motor.
     """
 
     joint: str
@@ -40,7 +38,6 @@ class Link:
     prismatic: bool
     lower: float
     upper: float
-    effort: float
 
     def transform(self, value: float) -> FloatArray:
         """Pose of the link in the one before it at a joint value [rad or m], (4, 4)."""
@@ -62,16 +59,13 @@ def _degrees(lower: float, upper: float) -> tuple[float, float]:
 
 # The yaw's +-91 degrees are the mechanism's; psm.json has a software bound of +-270 there.
 PSM_LINKS = (
-    Link("yaw", RIGHT, 0.0, RIGHT, 0.0, False, *_degrees(-91.0, 91.0), 4.97),
-    Link("pitch", -RIGHT, 0.0, -RIGHT, 0.0, False, *_degrees(-53.0, 53.0), 4.97),
-    Link("insertion", RIGHT, 0.0, 0.0, -0.4318, True, 0.0, 0.24, 14.81),
-    Link("roll", 0.0, 0.0, 0.0, 0.4162, False, *_degrees(-260.0, 260.0), 0.33),
-    Link("wrist_pitch", -RIGHT, 0.0, -RIGHT, 0.0, False, *_degrees(-80.0, 80.0), 0.25),
-    Link("wrist_yaw", -RIGHT, 0.0091, -RIGHT, 0.0, False, *_degrees(-80.0, 80.0), 0.20),
+    Link("yaw", RIGHT, 0.0, RIGHT, 0.0, False, *_degrees(-91.0, 91.0)),
+    Link("pitch", -RIGHT, 0.0, -RIGHT, 0.0, False, *_degrees(-53.0, 53.0)),
+    Link("insertion", RIGHT, 0.0, 0.0, -0.4318, True, 0.0, 0.24),
+    Link("roll", 0.0, 0.0, 0.0, 0.4162, False, *_degrees(-260.0, 260.0)),
+    Link("wrist_pitch", -RIGHT, 0.0, -RIGHT, 0.0, False, *_degrees(-80.0, 80.0)),
+    Link("wrist_yaw", -RIGHT, 0.0091, -RIGHT, 0.0, False, *_degrees(-80.0, 80.0)),
 )
-# Opening angle of the jaw [rad]; below 0 the closed fingers are pressed together. Largest torque [N m].
-JAW_RANGE = _degrees(-40.0, 80.0)
-JAW_EFFORT = 0.16
 # Orientation of the tip's frame in the last link's (`tooltip-offset`): its z points out of the tip.
 TIP_ROTATION = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 

@@ -364,16 +364,14 @@ def _fittings(evaluation: ArmsEvaluation) -> list[tuple[FloatArray, float, str]]
     return found
 
 
-def write_images(
-    pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder, *, name: str, description: str
-) -> list[Picture]:
-    """Write RGB images by caption as PNG files, numbered from 1, with a description of all."""
+def write_images(pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder) -> list[Picture]:
+    """Write pictures of the arms, RGB images by caption, as PNG files, numbered from 1."""
     from matplotlib.image import imsave
 
     written = []
-    for number, (caption, image) in enumerate(pictures.items(), start=1):
-        path = folder / f"{name}_{number}.png"
+    for number, (title, image) in enumerate(pictures.items(), start=1):
+        path = folder / f"arms_{number}.png"
         imsave(path, np.ascontiguousarray(image), format="png")
-        title = caption[0].upper() + caption[1:]
-        written.append(Picture.of_file(path, title, description))
+        shown = "Each tip is at a point that its arm reaches; an arm that reaches none stands at home."
+        written.append(Picture.of_file(path, title, shown))
     return written

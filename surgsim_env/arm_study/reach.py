@@ -20,7 +20,7 @@ from surgsim_env.arm_study.joint_search import (
     still_open,
 )
 from surgsim_env.arm_study.kinematics import BatchKinematics, Chain, cross, dot
-from surgsim_env.arm_study.results import ArmReach, Touch
+from surgsim_env.arm_study.results import ArmReach
 
 # Number of candidates whose clearance is computed at once.
 CANDIDATES_AT_ONCE = 20_000
@@ -86,7 +86,7 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles)
     found, clear = search.all_around(found, search.clear(found))
     usable = _every(clear)
     reason = _reasons(search, found, clear)
-    report = _report(search, found, usable, reason, _touches(search, found, clear, reason))
+    report = _report(search, found, usable, reason)
     return Reach(report, kinematics, found, usable)
 
 
@@ -171,30 +171,7 @@ def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> In
     return reason.astype(np.int32)
 
 
-def _touches(search: _Search, found: Candidates, clear: NDArray[np.bool_], reason: IntArray) -> tuple[Touch, ...]:
-    """Which parts touch the organ (reason 4) or the wall (5), with the candidate that comes nearest to the point."""
-    kinematics, touches = search.kinematics, []
-    error = found.position_error + found.trocar_error
-    for index, tried in ((4, clear[0]), (5, _every(clear[:2]))):
-        rows = np.flatnonzero(reason == index)
-        nearest = np.argmin(np.where(tried[rows], error[rows], np.inf), axis=1)
-        count = np.zeros(len(kinematics.arm.shape_names), dtype=np.int64)
-        for low in range(0, len(rows), CANDIDATES_AT_ONCE):
-            part = slice(low, low + CANDIDATES_AT_ONCE)
-            chain = kinematics.at(found.joints[rows[part], nearest[part]])
-            if index == 4:
-                gaps = search.around.organ_gaps(kinematics, chain, exact=False)
-            else:
-                gaps = search.around.wall_gaps(kinematics, chain)
-            count += (gaps < 0.0).sum(axis=0)
-        order = np.argsort(-count, kind="stable")
-        touches += [Touch(index, kinematics.arm.shape_names[s], int(count[s])) for s in order if count[s]]
-    return tuple(touches)
-
-
-def _report(
-    search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray, touches: tuple[Touch, ...]
-) -> ArmReach:
+def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
     kinematics, sites, around = search.kinematics, search.sites, search.around
     rows, good = np.arange(len(reason)), reason == 0
     worth = np.where(usable, limit_margin(kinematics, found.joints), -np.inf)
@@ -226,7 +203,6 @@ def _report(
         organ_clearance=organ,
         wall_clearance=where_reached(around.wall_clearance(kinematics, chain)),
         trocar_error=where_reached(kinematics.trocar_error(chain)),
-        touches=touches,
     )
 
 

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from surgsim_env.arm_study.episodes import ArmsEpisode, Episodes, StandIn
 from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation, ArmThroughCycle, ThroughCycle
 from surgsim_env.palpation.surface_drawing import tube
 from surgsim_env.scene.model import Port
@@ -16,23 +15,6 @@ PORTS = {
     "endoscope": Port((0.0, -0.12, 0.11), (0.0, 0.74, -0.67)),
 }
 PICTURE = np.arange(40 * 60 * 3, dtype=np.int64).reshape(40, 60, 3).astype(np.uint8)
-
-
-def made_episodes(*, failing=False):
-    """Two made-up episodes with a stand-in on the left; failing: the second one failed, a third never began."""
-    first = ArmsEpisode(3, True, 11.2, 0.37, 0.26, 0.46, 0.56, 0.0112, 0.0, 0.0)
-    runs = (first, ArmsEpisode(4, True, 12.4, 0.41, 0.20, 0.52, 0.60, 0.05, 0.1, 2.0))
-    if failing:
-        why = "step 4 of 9, 'lift', tore the tissue (1.203 N); tip at (40.00, 45.00, 20.00) mm, contact force 1.3 N"
-        runs = (
-            first,
-            ArmsEpisode(4, False, 5.0, 0.41, 0.20, 1.20, 0.0, 0.05, 0.1, 2.0, failure=why),
-            ArmsEpisode(5, False, failure="it could not begin: <no way>"),
-        )
-    ports = (Port((-0.01, 0.2, 0.06), (0.2, -0.9, -0.35)), Port((0.09, 0.2, 0.06), (-0.2, -0.9, -0.35)))
-    stand_ins = (StandIn("left", "psm_retractor", "psm_grasper", "jaw with flat pads to hold tissue with"),)
-    pictures = {"How the episode of seed 3 ended": PICTURE}
-    return Episodes("lobe", "psm_retractor", "psm_palpator", ports, stand_ins, runs=runs, pictures=pictures)
 
 
 def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0, 9.0), clearance=(0.004, 0.05)):
@@ -120,7 +102,6 @@ def made_follower(generator, reachable, *, quickest=0.5):
         joints=np.where(path[:, None], generator.uniform(-1.0, 1.0, (3, count, 3)), np.nan),
         clearance=np.where(path, generator.uniform(0.001, 0.01, (3, count)), np.nan),
         speed=speed,
-        speed_share=quickest * np.sin(np.linspace(0.0, math.pi, 11)),
         joint_names=names,
         hinge=np.array([True, True, False]),
         speed_limit=limit,
@@ -133,14 +114,11 @@ def made_cycle(evaluation, *, seed=0, quickest=0.5):
     left, right = (
         made_follower(generator, arm.reachable, quickest=quickest) for arm in (evaluation.left, evaluation.right)
     )
-    time = np.linspace(0.0, 4.0, 11)
     return ThroughCycle(
         motions=("breathing",),
         travel=np.array([0.0096]),
         period=np.array([4.0]),
         level=np.array([[0.0], [0.5], [1.0]]),
-        time=time,
-        course=np.sin(0.25 * math.pi * time) ** 2,
         left=left,
         right=right,
         both=evaluation.both & left.reachable & right.reachable,

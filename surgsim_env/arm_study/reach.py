@@ -11,13 +11,13 @@ from surgsim_env.arm_study.clearance import Obstacles, arm_distances
 from surgsim_env.arm_study.joint_search import (
     REACHED,
     Candidates,
+    across,
     approach_directions,
-    approach_share,
+    directions_met,
     from_directions,
     from_neighbours,
     from_starts,
     spread_starts,
-    still_open,
 )
 from surgsim_env.arm_study.kinematics import BatchKinematics, Chain, cross, dot
 from surgsim_env.arm_study.results import ArmReach
@@ -107,7 +107,8 @@ class _Search:
                 # Where none is usable, the second round too begins at candidates that meet the point.
                 usable = _every(clear)
                 begin = np.where(np.any(usable, axis=1, keepdims=True), usable, found.met)
-            wanted = still_open(self.directions, found, _every(clear)) & np.any(found.met, axis=1, keepdims=True)
+            lacking = ~directions_met(found.pointing, _every(clear), self.directions)
+            wanted = lacking & np.any(found.met, axis=1, keepdims=True)
             rows = np.flatnonzero(np.any(wanted, axis=1))
             more = _empty_like(found, self.directions.shape[1])
             if rows.size:
@@ -193,7 +194,7 @@ def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reaso
         reason=reason,
         joints=joints,
         position_error=found.position_error[rows, best],
-        approach_share=where_reached(approach_share(found.pointing, usable, search.directions)),
+        approach_share=where_reached(directions_met(found.pointing, usable, search.directions).mean(axis=1)),
         manipulability=where_reached(manipulability(values)),
         isotropy=where_reached(isotropy(values)),
         limit_margin=where_reached(limit_margin(kinematics, joints)),
@@ -274,9 +275,7 @@ def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatAr
     jacobian = np.concatenate([linear, CHARACTERISTIC_LENGTH * angular], axis=1)
     freedoms = kinematics.arm.joint_count
     if not kinematics.arm.remote_centre_fixed:
-        shaft = kinematics.shaft_jacobian(chain)
-        across = shaft - chain.along[:, :, None] * np.einsum("ni,nij->nj", chain.along, shaft)[:, None]
-        idle = np.linalg.svd(across)[2][:, 2:]
+        idle = np.linalg.svd(across(kinematics.shaft_jacobian(chain), chain.along))[2][:, 2:]
         jacobian, freedoms = jacobian @ np.swapaxes(idle, 1, 2), freedoms - 2
     values: FloatArray = np.asarray(np.linalg.svd(jacobian, compute_uv=False), dtype=np.float64)
     return values[:, : min(6, freedoms)]

@@ -3,9 +3,9 @@
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,7 @@ class ArmReach:
 
 @dataclass(frozen=True)
 class ArmThroughCycle:
-    """One arm while the organ moves, at every point, at the positions of `ThroughCycle`.
+    """One arm while the organ moves, at every point and position.
 
     What is along a path is NaN where the arm has none: it begins at rest where the arm reaches the point, keeps joint
     limits and trocar at every position, and touches neither organ nor wall.
@@ -78,19 +78,11 @@ class ArmThroughCycle:
         reachable: at each position by itself, whatever the joints before      (n_position, n_point)
         joints: along the path [m, rad]                                        (n_position, n_point, n_joint)
         clearance: smallest distance from organ and wall along the path [m]    (n_position, n_point)
-        speed: largest of each joint [rad/s or m/s]                            (n_point, n_joint)
-        joint_names: base to tip
-        hinge: whether a joint turns or slides                                 (n_joint,)
-        speed_limit: [rad/s or m/s]                                            (n_joint,)
     """
 
     reachable: NDArray[np.bool_]
     joints: FloatArray
     clearance: FloatArray
-    speed: FloatArray
-    joint_names: tuple[str, ...]
-    hinge: NDArray[np.bool_]
-    speed_limit: FloatArray
 
     @property
     def always(self) -> NDArray[np.bool_]:
@@ -102,16 +94,6 @@ class ArmThroughCycle:
         """Which points the arm has a path for, (n_point,)."""
         return np.isfinite(self.joints[0, :, 0])
 
-    @property
-    def joint_share(self) -> FloatArray:
-        """Each joint's largest speed as a share of its limit, (n_point, n_joint)."""
-        return self.speed / self.speed_limit
-
-    @property
-    def follows(self) -> NDArray[np.bool_]:
-        """Which points the arm can follow: it has a path, and no joint is too slow for it, (n_point,)."""
-        return self.has_path & (np.nan_to_num(self.joint_share, nan=np.inf) <= 1.0).all(axis=1)
-
 
 @dataclass(frozen=True)
 class ThroughCycle:
@@ -121,7 +103,6 @@ class ThroughCycle:
         motions: their names, the one that moves the organ most first
         travel: largest displacement of any point by each motion [m]                  (n_motion,)
         period: of each [s]                                                           (n_motion,)
-        level: share of each motion's top at each position, in the order of `motions` (n_position, n_motion)
         left, right: each arm
         both: reachable by both at once at each position                              (n_position, n_point)
     """
@@ -129,7 +110,6 @@ class ThroughCycle:
     motions: tuple[str, ...]
     travel: FloatArray
     period: FloatArray
-    level: FloatArray
     left: ArmThroughCycle
     right: ArmThroughCycle
     both: NDArray[np.bool_]
@@ -156,12 +136,11 @@ class ArmsEvaluation:
         both: reachable by both at once, the arms at least 5 mm apart                         (n_point,)
         arm_distance_inside, arm_distance_outside: smallest distance between the arms inside and outside the body
             with both tips at the point's neighbourhood [m], NaN where not both reach it      (n_point,)
-        summary: shares, extremes, versions, seed and inputs, as in summary.json, plain JSON types
         scene: name of the scene
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
-        pictures: RGB images (height, width, 3) uint8 of the arms in the patient, by caption
         ports: where the arms ("left", "right") and the camera ("endoscope") enter
         cycle: both arms while the patient breathes; None for one who holds still
+        picture: of the arms in the patient, RGB, (height, width, 3) uint8; None without one
     """
 
     points: FloatArray
@@ -172,13 +151,12 @@ class ArmsEvaluation:
     both: NDArray[np.bool_]
     arm_distance_inside: FloatArray
     arm_distance_outside: FloatArray
-    summary: Mapping[str, Any]
     scene: str
     surface_points: FloatArray
     surface_triangles: IntArray
-    pictures: Mapping[str, NDArray[np.uint8]]
     ports: Mapping[str, Port]
     cycle: ThroughCycle | None = None
+    picture: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -224,8 +202,7 @@ QUANTITIES = (
              "are left out."),
     Quantity("wall_clearance", "clearance from the body wall", "mm", 1e3, 1, "_m", True,
              "Smallest distance between the arm's surface and the body wall, a dome or plate through the ports; "
-             "parts in the hole about the arm's own port are left out. summary.json lists the sizes of wall "
-             "and hole."),
+             "parts in the hole about the arm's own port are left out."),
     Quantity("approach_share", "approach directions", "%", 100.0, 0, "", True,
              "Share of 32 directions, spread evenly over the half space above the surface, from which the tip can "
              "come to the point within 10 degrees."),
@@ -320,13 +297,6 @@ def worse_of_both(evaluation: ArmsEvaluation, quantity: Quantity) -> FloatArray:
     return np.where(evaluation.both, pair.min(axis=0) if quantity.more_is_better else pair.max(axis=0), np.nan)
 
 
-def reason_counts(arm: ArmReach) -> list[tuple[str, int]]:
-    """Reasons why points are not reached with the number of points, the most frequent first."""
-    counts = np.bincount(arm.reason, minlength=len(REASONS))[1:]
-    order = sorted(range(len(counts)), key=lambda index: (-counts[index], index))
-    return [(REASONS[index + 1], int(counts[index])) for index in order if counts[index]]
-
-
 def clearances(evaluation: ArmsEvaluation) -> FloatArray:
     """The smaller of the distances from organ and wall of either arm at every point that it reaches [m], (n,)."""
     parts = [
@@ -353,7 +323,6 @@ def verdict(evaluation: ArmsEvaluation) -> str:
 class Ranked:
     """A row of the ranking; shares 0 to 1, median clearance [m], smallest force [N], NaN where nothing is reached."""
 
-    place: int
     name: str
     what: str
     left: float
@@ -365,7 +334,7 @@ class Ranked:
 
 
 # Columns of points.csv of each arm while the patient breathes.
-CYCLE_COLUMNS = ("always", "follows", "path_clearance_worst_m", "speed_share", "speed_joint")
+CYCLE_COLUMNS = ("always", "has_path", "path_clearance_worst_m")
 
 
 def columns(evaluation: ArmsEvaluation) -> list[str]:
@@ -406,10 +375,7 @@ def _cycle_cells(cycle: ThroughCycle, index: int) -> list[str]:
     """The cells of a point under CYCLE_COLUMNS for each arm, and whether both reach it at every position."""
     cells = []
     for _, arm in cycle.arms:
-        share = arm.joint_share[index]
-        cells += [str(int(arm.always[index])), str(int(arm.follows[index]))]
-        cells += [_cell(arm.clearance[:, index].min()), _cell(share.max())]
-        cells.append(arm.joint_names[int(share.argmax())] if arm.has_path[index] else "")
+        cells += [str(int(arm.always[index])), str(int(arm.has_path[index])), _cell(arm.clearance[:, index].min())]
     return [*cells, str(int(cycle.both_always[index]))]
 
 
@@ -419,8 +385,7 @@ def rank(candidates: Sequence[tuple[str, str, ArmsEvaluation]]) -> list[Ranked]:
     Args:
         candidates: name, description in a few words, and evaluation of each.
     """
-    ordered = sorted((_row(*one) for one in candidates), key=_rank_key)
-    return [replace(row, place=place) for place, row in enumerate(ordered, start=1)]
+    return sorted((_row(*one) for one in candidates), key=_rank_key)
 
 
 def _row(name: str, what: str, evaluation: ArmsEvaluation) -> Ranked:
@@ -429,7 +394,7 @@ def _row(name: str, what: str, evaluation: ArmsEvaluation) -> Ranked:
     masks = (by_left, by_right, together, by_left | by_right)
     left, right, both, either = (float(mask[outer].mean()) if outer.any() else 0.0 for mask in masks)
     force = spread(np.concatenate([arm.tip_force[arm.reachable] for _, arm in sides(evaluation)])).least
-    return Ranked(0, name, what, left, right, both, either, spread(clearances(evaluation)).median, force)
+    return Ranked(name, what, left, right, both, either, spread(clearances(evaluation)).median, force)
 
 
 def _rank_key(row: Ranked) -> tuple[float, ...]:

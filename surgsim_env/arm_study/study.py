@@ -1,12 +1,8 @@
 """Two arms on a patient's anatomy: reach, dexterity and clearances evaluated; setups ranked; report and files."""
 
-import json
-import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,8 +11,8 @@ from rich.console import Console
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.arm_study.clearance import ClusteredSurface, Obstacles
 from surgsim_env.arm_study.kinematics import BatchKinematics
-from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_images
-from surgsim_env.arm_study.ports import InnerTarget, Ports, default_ports, read_ports
+from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_picture
+from surgsim_env.arm_study.ports import Ports, default_ports, read_ports
 from surgsim_env.arm_study.reach import (
     Sites,
     evaluate_both,
@@ -30,7 +26,6 @@ from surgsim_env.arm_study.results import (
     REASONS,
     SHARE_DEFINITIONS,
     SIDES,
-    ArmReach,
     ArmsEvaluation,
     Ranked,
     number_text,
@@ -45,7 +40,6 @@ from surgsim_env.arm_study.results import (
 )
 from surgsim_env.arm_study.through_cycle import cycle_section, evaluate_cycle
 from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.palpation.job import package_version, plain_json
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.reports.html_page import Picture, render_page
 from surgsim_env.reports.output_folder import AnyFolder
@@ -57,12 +51,11 @@ from surgsim_env.scene.model import Scene
 
 # Places from which each point is chosen.
 PLACES_PER_POINT = 12
-REPORT_NAME, POINTS_NAME, SUMMARY_NAME = "report.html", "points.csv", "summary.json"
+REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
 # Every file that a study can write; which pictures there are depends on the arms and OpenGL.
 RESULT_NAMES = (
-    *(REPORT_NAME, POINTS_NAME, SUMMARY_NAME, "map_reach.png", "map_arm_distance.png"),
+    *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, "map_reach.png"),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
-    *("arms_1.png", "arms_2.png"),
 )
 Rows = list[tuple[str, ...]]
 
@@ -76,7 +69,7 @@ def evaluate_arms(
     seed: int = 0,
     count: int = 500,
     progress: StepProgress | None = None,
-    pictures: bool = False,
+    picture: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
 
@@ -90,7 +83,7 @@ def evaluate_arms(
         seed: draws the first point of the surface.
         count: number of points of the surface.
         progress: shows the steps.
-        pictures: whether to draw the arms in the patient; without OpenGL there are none, `progress` says why.
+        picture: whether to draw the arms in the patient; without OpenGL there is none, `progress` says why.
 
     Raises:
         ValueError: one line with what is wrong in scene, arm or ports, and the way out.
@@ -121,38 +114,27 @@ def evaluate_arms(
     if anatomy.scene.motions:
         obstacles = around[0], around[1]
         cycle = evaluate_cycle((reaches[0], reaches[1]), both, sites, obstacles, anatomy, progress)
-    reports = reaches[0].report, reaches[1].report
-    inputs = {
-        "scene": anatomy.scene.name,
-        **{side: report.name for side, report in zip(SIDES, reports, strict=True)},
-        "ports": asdict(where),
-        "count": count,
-        "seed": seed,
-    }
-    points, triangles = anatomy.outer_surface
+    surface, triangles = anatomy.outer_surface
     found = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
         inner=sites.inner,
-        left=reports[0],
-        right=reports[1],
+        left=reaches[0].report,
+        right=reaches[1].report,
         both=both.reachable,
         arm_distance_inside=both.inside,
         arm_distance_outside=both.outside,
-        summary={},
         scene=anatomy.scene.name,
-        surface_points=points,
+        surface_points=surface,
         surface_triangles=triangles,
-        pictures={},
         ports=where.frames,
         cycle=cycle,
     )
-    found = replace(found, summary=_summary(found, where.targets, inputs))
-    if pictures:
+    if picture:
         try:
-            found = replace(found, pictures=draw_arms(found, (arms[0], arms[1]), where))
+            found = replace(found, picture=draw_arms(found, arms, where))
         except NoGLError as error:
-            progress.say(f"no pictures: {error}")
+            progress.say(f"no picture: {error}")
     return found
 
 
@@ -178,10 +160,8 @@ def facing_points(anatomy: Anatomy, ports: ArrayLike, count: int, seed: int) -> 
     next point is the one furthest from all before it (farthest-point sampling), the first drawn from the seed.
 
     Raises:
-        ValueError: fewer than one point asked for, or no triangle faces the ports.
+        ValueError: no triangle faces the ports.
     """
-    if count < 1:
-        raise ValueError(f"{count} points of the surface asked for; at least 1 is needed")
     corners = anatomy.mesh.points[anatomy.mesh.boundary_triangles]
     held = np.isin(anatomy.mesh.boundary_triangles, anatomy.anchors).all(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -218,51 +198,6 @@ def _spread(points: FloatArray, count: int, first: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def _summary(found: ArmsEvaluation, targets: Sequence[InnerTarget], inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Shares, extremes, targets, versions and inputs; SI units; the same run gives the same text."""
-    outer, left, right = ~found.inner, found.left, found.right
-    reached = {
-        "left": left.reachable,
-        "right": right.reachable,
-        "either": left.reachable | right.reachable,
-        "both": found.both,
-    }
-    summary = {
-        "points": int(outer.sum()),
-        "reachable": {name: float(mask[outer].mean()) for name, mask in reached.items()},
-        "left": _arm_summary(left, outer),
-        "right": _arm_summary(right, outer),
-        "arm_distance_inside": spread(found.arm_distance_inside[outer])._asdict(),
-        "arm_distance_outside": spread(found.arm_distance_outside[outer])._asdict(),
-        "targets": [
-            {
-                "name": target.name,
-                "point": target.point,
-                "left": REASONS[left.reason[row]],
-                "right": REASONS[right.reason[row]],
-                "both": found.both[row],
-            }
-            for row, target in zip(np.flatnonzero(found.inner), targets, strict=True)
-        ],
-        "versions": {
-            "surgsim": package_version(),
-            "python": platform.python_version(),
-            **{name: version(name) for name in ("numpy", "scipy", "mujoco")},
-        },
-        "inputs": inputs,
-    }
-    return plain_json(summary, digits=12)
-
-
-def _arm_summary(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
-    counts = {reason: int((arm.reason[outer] == index).sum()) for index, reason in enumerate(REASONS)}
-    return {
-        "arm": arm.name,
-        "reasons": counts,
-        **{one.field: spread(getattr(arm, one.field)[outer])._asdict() for one in QUANTITIES},
-    }
-
-
 @dataclass(frozen=True)
 class ArmSetup:
     """Two arms at their ports.
@@ -290,7 +225,7 @@ def run_study(
     seed: int,
     command: str,
 ) -> list[str]:
-    """Evaluate the setups, rank them if there are several, and write report, points, heat maps, pictures and summary.
+    """Evaluate the setups, rank them if there are several, and write report, points, heat maps and picture.
 
     Args:
         setups: the one that is reported first, then those it is compared with.
@@ -299,7 +234,7 @@ def run_study(
         console: for progress and results.
         points: number of points of the organ to be tried.
         seed: of the points.
-        command: the command line, for the report and the summary.
+        command: the command line, for the report.
 
     Returns:
         The names of the files.
@@ -317,23 +252,17 @@ def run_study(
                     seed=seed,
                     count=points,
                     progress=progress,
-                    pictures=setup is setups[0],
+                    picture=setup is setups[0],
                 )
             )
         first = found[0]
         maps = ArmMaps(first).write_all(folder, progress)
     ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
-    said = verdict(first)
-    more = {"verdict": said, "command": command, "compared": [vars(one) for one in ranking]}
-    summary = {**first.summary, **plain_json(more, digits=12)}
-    (folder / SUMMARY_NAME).write_text(
-        json.dumps(summary, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
     write_points(first, folder / POINTS_NAME)
-    pictures = write_images(first.pictures, folder)
+    pictures = [] if first.picture is None else [write_picture(first.picture, folder / PICTURE_NAME)]
     write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
-    console.print(said, highlight=False)
-    return [REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps))]
+    console.print(verdict(first), highlight=False)
+    return [REPORT_NAME, POINTS_NAME, *(one.name for one in (*pictures, *maps))]
 
 
 def write_report(

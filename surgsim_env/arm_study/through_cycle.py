@@ -1,4 +1,4 @@
-"""Two arms on a patient who breathes: reach, clearance and following through the cycle, and the report's tables.
+"""Two arms on a patient who breathes: reach, paths and clearance through the cycle, and the report's tables.
 
 The organ goes with its ground, as at slow motion: its points and surface are displaced, its normals are not turned.
 Ports, body wall and endoscope stay.
@@ -6,7 +6,7 @@ Ports, body wall and endoscope stay.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.arm_study.clearance import ClusteredSurface, Obstacles
-from surgsim_env.arm_study.following import STEPS, Cycle, make_cycle, speeds_through_cycle
 from surgsim_env.arm_study.joint_search import Wanted, search_joints
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.arm_study.reach import (
@@ -35,6 +34,47 @@ from surgsim_env.arm_study.results import (
 )
 from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import CyclicMotion
+
+# Evenly spaced positions between rest and top of the motion that moves the organ most.
+STEPS = 5
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """Positions of an organ that are evaluated: each motion in its largest cycle.
+
+    From rest to the top of the motion that moves the organ most in even steps, the others at rest; then, if there are
+    others, rest and top again with all others at their tops.
+
+    Fields:
+        motions: of the scene
+        main: index of the motion that moves the organ most
+        level: share of each motion's top at each position                   (n_position, n_motion)
+        before: the position from which an arm comes to each; the first has none
+    """
+
+    motions: tuple[CyclicMotion, ...]
+    main: int
+    level: FloatArray
+    before: tuple[int, ...]
+
+    @property
+    def signals(self) -> FloatArray:
+        """Signals of the motions at each position, (n_position, n_motion)."""
+        return self.level * np.array([one.size[1] for one in self.motions])
+
+
+def make_cycle(motions: Sequence[CyclicMotion]) -> Cycle:
+    """The positions of an organ with at least one motion."""
+    main = int(np.argmax([math.hypot(*one.displacement) * one.size[1] for one in motions]))
+    alone = np.arange(len(motions)) == main
+    level = np.linspace(0.0, 1.0, STEPS + 1)[:, None] * alone
+    before = [max(number - 1, 0) for number in range(STEPS + 1)]
+    if len(motions) > 1:
+        level = np.concatenate([level, [~alone, np.ones(len(motions))]])
+        before += [0, STEPS]
+    return Cycle(tuple(motions), main, level, tuple(before))
 
 
 def evaluate_cycle(
@@ -77,17 +117,16 @@ def evaluate_cycle(
         followed = []
         for arm, obstacles, rows in zip(arms, around, reachable, strict=True):
             moved = [replace(obstacles, organ=organ) for organ in organs]
-            followed.append(_followed(arm, cycle, places, moved, shifts, np.stack(rows)))
+            followed.append(_followed(arm, cycle, places, moved, np.stack(rows)))
             advance(1)
     kinematics = arms[0].kinematics, arms[1].kinematics
     moved = [tuple(replace(one, organ=organ) for one in around) for organ in organs]
-    order = [cycle.main, *cycle.others]
+    order = [cycle.main, *(m for m in range(len(cycle.motions)) if m != cycle.main)]
     motions = [cycle.motions[number] for number in order]
     return ThroughCycle(
         motions=tuple(one.name for one in motions),
         travel=np.array([cycle.motions[m].size[1] * np.linalg.norm(nodes[m], axis=1).max() for m in order]),
         period=np.array([one.period[0] for one in motions]),
-        level=cycle.level[:, order],
         left=followed[0],
         right=followed[1],
         both=_together(kinematics, cycle, places, moved, together),
@@ -99,11 +138,10 @@ def _followed(
     cycle: Cycle,
     places: Sequence[Sites],
     around: Sequence[Obstacles],
-    shifts: FloatArray,
     reachable: NDArray[np.bool_],
 ) -> ArmThroughCycle:
     """An arm along paths that begin at the reported joints, or where these end at an obstacle at other candidates."""
-    kinematics, n_point = arm.kinematics, len(shifts[0])
+    kinematics, n_point = arm.kinematics, reachable.shape[1]
     paths = np.full((len(places), n_point, kinematics.arm.joint_count), np.nan)
     rows = np.flatnonzero(arm.report.reachable)
     starts = [arm.report.joints[rows], *np.swapaxes(ways(arm, rows), 0, 1)] if rows.size else []
@@ -115,24 +153,13 @@ def _followed(
         paths[:, rows[left][kept]] = path[:, kept]
     rows = np.flatnonzero(~np.isnan(paths[0, :, 0]))
     clearance = np.full((len(places), n_point), np.nan)
-    speed = np.full((n_point, kinematics.arm.joint_count), np.nan)
     if rows.size:
         for number, (sites, obstacles) in enumerate(zip(places, around, strict=True)):
             chain = kinematics.at(paths[number, rows])
             organ = obstacles.organ_clearance(kinematics, chain, exact=True)
             organ = np.where(sites.inner[rows], np.inf, organ)
             clearance[number, rows] = np.minimum(organ, obstacles.wall_clearance(kinematics, chain))
-        alone = paths[: STEPS + 1, rows]
-        speed[rows] = speeds_through_cycle(kinematics, cycle, alone, shifts[:, rows]).max(axis=0)
-    return ArmThroughCycle(
-        reachable=reachable,
-        joints=paths,
-        clearance=clearance,
-        speed=speed,
-        joint_names=tuple(kinematics.arm.joints),
-        hinge=kinematics.hinge,
-        speed_limit=kinematics.arm.speed_limit,
-    )
+    return ArmThroughCycle(reachable, paths, clearance)
 
 
 def _path(
@@ -210,12 +237,6 @@ def _worst_and_median(values: FloatArray) -> dict[str, float]:
     }
 
 
-def _greatest(values: FloatArray) -> FloatArray:
-    """The largest of each joint over the points that have a path, (n_joint,); NaN where none has."""
-    known = values[np.isfinite(values).all(axis=1)]
-    return known.max(axis=0) if len(known) else np.full(values.shape[1], np.nan)
-
-
 def cycle_section(evaluation: ArmsEvaluation) -> dict[str, Any] | None:
     """Contents of the report's section on the cycle; None for a patient who holds still."""
     cycle, outer = evaluation.cycle, ~evaluation.inner
@@ -227,23 +248,22 @@ def cycle_section(evaluation: ArmsEvaluation) -> dict[str, Any] | None:
     ]
     return {
         "motions": ", ".join(parts),
-        "positions": len(cycle.level),
+        "positions": len(cycle.both),
         "reach": _reach_rows(cycle, outer),
         "clearance": _clearance_rows(cycle, outer),
-        "joints": _joint_rows(cycle),
     }
 
 
 def _reach_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
-    """Shares of points at rest, median and least over the positions, at every position, and followed."""
-    rows = [(f"{side} arm", arm.reachable, _per_cent(float(arm.follows[outer].mean()))) for side, arm in cycle.arms]
+    """Shares of points at rest, median and least over the positions, at every position, and with a path."""
+    rows = [(f"{side} arm", arm.reachable, _per_cent(float(arm.has_path[outer].mean()))) for side, arm in cycle.arms]
     rows.append(("both at once", cycle.both, ""))
     texts = []
-    for name, reachable, follows in rows:
+    for name, reachable, path in rows:
         each = reachable[:, outer]
         share = each.mean(axis=1)
         figures = (share[0], float(np.median(share)), float(share.min()), float(each.all(axis=0).mean()))
-        texts.append((name, *map(_per_cent, figures), follows))
+        texts.append((name, *map(_per_cent, figures), path))
     return texts
 
 
@@ -252,16 +272,6 @@ def _clearance_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple
     for side, arm in cycle.arms:
         found = _worst_and_median(arm.clearance[:, outer])
         rows.append((f"{side} arm: clearance [mm]", *(number_text(one, 1e3, 2) for one in found.values())))
-    return rows
-
-
-def _joint_rows(cycle: ThroughCycle) -> list[tuple[str, ...]]:
-    rows = []
-    for side, arm in cycle.arms:
-        for index, speed in enumerate(_greatest(arm.speed)):
-            unit, limit = "rad/s" if arm.hinge[index] else "m/s", arm.speed_limit[index]
-            figures = f"{number_text(speed, 1.0, 3)} {unit}", f"{limit:g} {unit}", _per_cent(speed / limit)
-            rows.append((f"{side} arm: {arm.joint_names[index]}", *figures))
     return rows
 
 

@@ -24,7 +24,7 @@ PORT_TABLES = {"left", "right", "endoscope"}
 class Arms:
     """Evaluate two arms on a patient's organ: reach of each and of both at once, clearances, forces, dexterity.
 
-    Writes report.html (self-contained), points.csv, heat maps (PNG) and summary.json. See docs/arms_report.md.
+    Writes report.html (self-contained), points.csv, heat maps and a picture (PNG). See docs/arms_report.md.
     """
 
     left: str
@@ -41,9 +41,9 @@ class Arms:
     points: int = 500
     """Number of points of the organ to be tried."""
     seed: int = 0
-    """Seed of the points and of the starts of the searches for joints."""
+    """Seed of the points."""
     motion: str | None = None
-    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, clearance and following
+    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, paths and clearance
     through the cycle to the report."""
     out: Path = Path("runs/arms")
     """Folder for the results."""
@@ -63,7 +63,7 @@ class Arms:
         return shlex.join([*words, *map(str, counts)])
 
     def run(self, console: Console) -> int:
-        """Evaluate and write report.html, points.csv, the heat maps and summary.json.
+        """Evaluate and write report.html, points.csv, the heat maps and a picture of the arms.
 
         Raises:
             ValueError: one line about an option that is not possible.

@@ -45,7 +45,7 @@ def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0,
 
 
 def made_evaluation(
-    *, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), pictures=True, **reach
+    *, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), picture=True, **reach
 ):
     """Two arms, the left one reaching what lies at x > -left_to of the half axis, the right one at x < right_to."""
     generator = np.random.default_rng(seed)
@@ -77,48 +77,34 @@ def made_evaluation(
         both=both,
         arm_distance_inside=inside,
         arm_distance_outside=outside,
-        summary={
-            "seed": seed,
-            "inputs": {"scene": "ellipsoid", "left": "psm_grasper", "right": "psm_palpator", "points": count},
-            "versions": {"surgsim": "0.1.0", "numpy": np.__version__},
-        },
         scene="ellipsoid",
         surface_points=sphere * HALF_AXES,
         surface_triangles=triangles,
-        pictures={"both arms at one point, from the camera": PICTURE} if pictures else {},
         ports=PORTS,
+        picture=PICTURE if picture else None,
     )
 
 
-def made_follower(generator, reachable, *, quickest=0.5):
+def made_follower(generator, reachable):
     """An arm at three positions: it loses a tenth of its points at the top, and has a path for the others."""
     count = len(reachable)
     each = np.stack([reachable, reachable, reachable & (generator.random(count) > 0.1)])
     path = np.asarray(each.all(axis=0))
-    names, limit = ("yaw", "pitch", "insertion"), np.array([2.0, 1.0, 0.4])
-    speed = np.where(path[:, None], generator.uniform(0.1, quickest, (count, 3)) * limit, np.nan)
     return ArmThroughCycle(
         reachable=each,
         joints=np.where(path[:, None], generator.uniform(-1.0, 1.0, (3, count, 3)), np.nan),
         clearance=np.where(path, generator.uniform(0.001, 0.01, (3, count)), np.nan),
-        speed=speed,
-        joint_names=names,
-        hinge=np.array([True, True, False]),
-        speed_limit=limit,
     )
 
 
-def made_cycle(evaluation, *, seed=0, quickest=0.5):
+def made_cycle(evaluation, *, seed=0):
     """A breath at rest, half way and at the top, for the points of an evaluation."""
     generator = np.random.default_rng(seed)
-    left, right = (
-        made_follower(generator, arm.reachable, quickest=quickest) for arm in (evaluation.left, evaluation.right)
-    )
+    left, right = (made_follower(generator, arm.reachable) for arm in (evaluation.left, evaluation.right))
     return ThroughCycle(
         motions=("breathing",),
         travel=np.array([0.0096]),
         period=np.array([4.0]),
-        level=np.array([[0.0], [0.5], [1.0]]),
         left=left,
         right=right,
         both=evaluation.both & left.reachable & right.reachable,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.pictures import ArmMaps, write_images
+from surgsim_env.arm_study.pictures import ArmMaps, write_picture
 from surgsim_env.arm_study.results import rank
 from surgsim_env.arm_study.study import write_report
 from surgsim_env.reports.html_page import POLICY
@@ -46,7 +46,7 @@ def report(tmp_path_factory) -> Path:
     write_report(
         evaluation,
         path,
-        pictures=write_images(evaluation.pictures, folder),
+        pictures=[write_picture(evaluation.picture, folder / "arms.png")],
         maps=ArmMaps(evaluation).write_all(folder),
         command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
         ranking=rank(others),
@@ -81,7 +81,7 @@ def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, s
     browser = shown(report, width)
     made = browser.run(MADE)
     assert browser.complaints() == []
-    assert len(made["images"]) == text.count("<img") == 12
+    assert len(made["images"]) == text.count("<img") == 11
     assert min(made["images"]) >= 60
     assert made["widest"] <= made["window"] == width
     assert made["loaded"] == 0

@@ -12,7 +12,7 @@ from surgsim_env.arm_study.ports import EndoscopePort, PortPlace, Ports, Wall
 from surgsim_env.arm_study.reach import ARM_DISTANCE, Sites, evaluate_both, evaluate_reach, tip_ball
 from surgsim_env.arm_study.results import REASONS
 from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.instruments.arm.psm import PSM_LINKS, shaft_depth
+from surgsim_env.instruments.arm.psm import PSM_LINKS
 from surgsim_env.scene.model import Port
 from tests.arm_study.pivot_arm import RADIUS, SITE, TABLE, pivot, pivot_excess, write_pivot
 from tests.instruments.joints import random_joints
@@ -76,7 +76,7 @@ def test_psm_reaches_its_cone_and_depths():
     """
     arm = load_arm("psm_grasper", Port())
     kinematics = BatchKinematics(arm)
-    pitch_limit, wrist_most = PSM_LINKS[1].upper, shaft_depth(PSM_LINKS[2].upper)
+    pitch_limit, wrist_most = PSM_LINKS[1].upper, PSM_LINKS[2].upper + PSM_LINKS[2].d + PSM_LINKS[3].d
     beyond = PSM_LINKS[5].a + 0.0102
     rng = np.random.default_rng(2)
     yaw, depth = rng.uniform(-1.2, 1.2, 300), rng.uniform(0.03, 0.30, 300)

@@ -41,6 +41,6 @@ def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch)
     monkeypatch.setattr(study, "evaluate_arms", lambda *_, **__: made_evaluation())
     assert main(command.split()) == 0
     listed = re.findall(r"^\| `([\w.*]+)` \|", DOCS, flags=re.M)
-    assert len(listed) == 5
+    assert len(listed) == 4
     for pattern in listed:
         assert list(Path("runs/arms").glob(pattern)), pattern

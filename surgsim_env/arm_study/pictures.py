@@ -67,7 +67,7 @@ SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
 # The endoscope is drawn this far out of its port [m].
 SCOPE_OUTSIDE = 0.18
 # Field of view of the camera beside the table [degrees], and share of the picture that the arms fill.
-BESIDE_FOV, SHARE = 35.0, 0.94
+BESIDE_FOV, SHARE = 35.0, 0.85
 
 
 class ArmMaps:
@@ -213,7 +213,9 @@ def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: OrthographicView) 
         letter, colour = PORT_MARKS[name]
         place = view.flat(np.array([port.point]))[0]
         axes.plot(*place, "o", ms=12, color=colour, mec="white", mew=1.2, zorder=5)
-        axes.text(*place, letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6)
+        axes.text(
+            place[0], place[1], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6
+        )
 
 
 def _norm(panels: list[Panel], scale: float) -> Normalize:

@@ -185,10 +185,6 @@ class Obstacles:
 
         Not exact: 0 or more means clear, less means touching.
         """
-        return self.organ_gaps(kinematics, chain, exact=exact).min(axis=1)
-
-    def organ_gaps(self, kinematics: BatchKinematics, chain: Chain, *, exact: bool) -> FloatArray:
-        """The same for each shape, (n, n_shape); inf for one within the tip's zone."""
         radius = kinematics.arm.shape_radius
         parts, left = outside_ball(chain.shape_ends, chain.tip[:, None], self.ball + TIP_ZONE)
         row, shape, part = np.nonzero(left)
@@ -196,15 +192,12 @@ class Obstacles:
         gaps = self.organ.distance(parts[row, shape, part], cap) - radius[shape]
         result = np.full(chain.shape_ends.shape[:2], np.inf)
         np.minimum.at(result, (row, shape), gaps)
-        return result
+        return result.min(axis=1)
 
     def wall_clearance(self, kinematics: BatchKinematics, chain: Chain) -> FloatArray:
         """Distance of all shapes outside the port's hole from the body wall [m], (n,)."""
-        return self.wall_gaps(kinematics, chain).min(axis=1)
-
-    def wall_gaps(self, kinematics: BatchKinematics, chain: Chain) -> FloatArray:
-        """The same for each shape, (n, n_shape)."""
-        return wall_clearance(self.ports, chain.shape_ends, kinematics.trocar) - kinematics.arm.shape_radius
+        gaps = wall_clearance(self.ports, chain.shape_ends, kinematics.trocar) - kinematics.arm.shape_radius
+        return gaps.min(axis=1)
 
 
 def wall_clearance(ports: Ports, segments: FloatArray, trocar: FloatArray) -> FloatArray:

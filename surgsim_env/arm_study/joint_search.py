@@ -213,12 +213,6 @@ def from_directions(
     return _search(kinematics, wanted, begin, (len(tips), DIRECTION_COUNT))
 
 
-def still_open(directions: FloatArray, found: Candidates, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which directions (n, 32, 3) no usable candidate has yet, (n, 32)."""
-    cosine = -np.einsum("nki,ndi->ndk", found.pointing, directions)
-    return ~((cosine >= np.cos(APPROACH_ANGLE)) & usable[:, None]).any(axis=2)
-
-
 def _search(kinematics: BatchKinematics, wanted: Wanted, begin: FloatArray, shape: tuple[int, int]) -> Candidates:
     found = vars(search_joints(kinematics, wanted, begin)).values()
     return Candidates(*(values.reshape(*shape, *values.shape[1:]) for values in found))
@@ -253,7 +247,7 @@ def _tangential(vectors: FloatArray, normals: FloatArray) -> FloatArray:
     return vectors - (vectors * normals).sum(axis=1)[:, None] * normals
 
 
-def approach_share(pointing: FloatArray, usable: np.ndarray, directions: FloatArray) -> FloatArray:
-    """Share of directions (n, 32, 3) that usable tips (n, k), pointing along (n, k, 3), have within 10 degrees."""
+def directions_met(pointing: FloatArray, usable: NDArray[np.bool_], directions: FloatArray) -> NDArray[np.bool_]:
+    """Which directions (n, 32, 3) usable tips (n, k), pointing along (n, k, 3), have within 10 degrees, (n, 32)."""
     cosine = -np.einsum("nki,ndi->nkd", pointing, directions)
-    return ((cosine >= math.cos(APPROACH_ANGLE)) & usable[:, :, None]).any(axis=1).mean(axis=1)
+    return np.any((cosine >= math.cos(APPROACH_ANGLE)) & usable[:, :, None], axis=1)

@@ -1,12 +1,8 @@
-"""Heat maps of two arms on an organ's surface, and pictures of both where there is OpenGL.
-
-In the pictures each arm has its tip at the point that `poses` names; an arm that reaches nothing stands at home.
-"""
+"""Heat maps of two arms on an organ's surface, and a picture of both at home where there is OpenGL."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,15 +15,11 @@ from scipy.spatial import KDTree
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.arm_study.ports import Ports
 from surgsim_env.arm_study.results import (
-    DISTANCES,
     QUANTITIES,
-    SIDES,
     ArmsEvaluation,
     Quantity,
-    reason_counts,
     share_text,
     sides,
-    spread,
     values_of,
     worse_of_both,
 )
@@ -40,7 +32,7 @@ from surgsim_env.palpation.surface_drawing import (
     draw_patches,
     save_png,
 )
-from surgsim_env.rendering.cameras import Camera
+from surgsim_env.rendering.cameras import filling
 from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
 from surgsim_env.reports.html_page import Picture
 from surgsim_env.reports.output_folder import AnyFolder
@@ -67,18 +59,15 @@ DPI = 100
 # Share of a colour that the light does not change.
 FLATNESS = 0.6
 
-# Of a map: title, which points have a value, the values [SI], and a text about the other points.
-Panel = tuple[str, NDArray[np.bool_], FloatArray, str]
+# Of a map: title, which points have a value, and the values [SI].
+Panel = tuple[str, NDArray[np.bool_], FloatArray]
 SIZE = 960, 720
-SCOPE, PORT, WALL = "#5c6470", "#f2bf33", (0.85, 0.65, 0.55, 0.18)
+SCOPE, PORT, WALL = (0.36, 0.39, 0.44, 1.0), (0.95, 0.75, 0.2, 1.0), (0.85, 0.65, 0.55, 0.18)
 SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
 # The endoscope is drawn this far out of its port [m].
 SCOPE_OUTSIDE = 0.18
-# Fields of view of the camera beside the table and of the endoscope [degrees]; how far inside its port the latter's
-# camera is [m].
-BESIDE_FOV, SCOPE_FOV, SCOPE_TIP = 35.0, 70.0, 0.02
-# Each tip is put this far from the middle of the common points, towards its own port [m].
-ASIDE = 0.025
+# Field of view of the camera beside the table [degrees], and share of the picture that the arms fill.
+BESIDE_FOV, SHARE = 35.0, 0.85
 
 
 class ArmMaps:
@@ -103,13 +92,13 @@ class ArmMaps:
         self._view = camera_view(evaluation)
 
     def write_all(self, folder: AnyFolder, progress: StepProgress | None = None) -> list[Picture]:
-        """Write all maps into a folder: reach, each quantity, and the arms' distances; a step of `progress`."""
+        """Write all maps into a folder: reach, and each quantity; a step of `progress`."""
         # The two errors are checks of the method and the same everywhere: the table suffices.
         shown = [quantity for quantity in QUANTITIES if quantity.field not in ("position_error", "trocar_error")]
         quantities = [partial(self._write_quantity, quantity=quantity) for quantity in shown]
         written = []
-        with (progress or StepProgress()).step("drawing the maps", len(quantities) + 2) as advance:
-            for write in (self._write_reach, *quantities, self._write_distances):
+        with (progress or StepProgress()).step("drawing the maps", len(quantities) + 1) as advance:
+            for write in (self._write_reach, *quantities):
                 written.append(write(folder))
                 advance(1)
         return written
@@ -143,48 +132,25 @@ class ArmMaps:
 
     def _write_quantity(self, folder: AnyFolder, quantity: Quantity) -> Picture:
         one = self.evaluation
-        panels = [
-            (f"{side} arm", arm.reachable, values_of(arm, quantity), _misses(reason_counts(arm)))
-            for side, arm in sides(one)
-        ]
-        close = int((one.left.reachable & one.right.reachable & ~one.both).sum())
-        missed = f"grey, points:\nnot reached by each arm: {int((~one.both).sum()) - close}\narms too close: {close}"
-        panels.append(("both at once, the worse arm", one.both, worse_of_both(one, quantity), missed))
+        panels = [(f"{side} arm", arm.reachable, values_of(arm, quantity)) for side, arm in sides(one)]
+        panels.append(("both at once, the worse arm", one.both, worse_of_both(one, quantity)))
         name = f"map_{quantity.field}.png"
         sense = "more is better" if quantity.more_is_better else "less is better"
         label = f"{quantity.label}\n{sense}"
         self._write_panels(folder / name, quantity.title, label, quantity.scale, panels)
-        text = "; ".join(
-            f"{title}: {_spread(values, quantity)} over {share_text(mask[self._surface])} of the surface's points"
-            for title, mask, values, _ in panels
-        )
         title = quantity.title[0].upper() + quantity.title[1:]
-        return Picture.of_file(folder / name, title, f"{text}. Grey: not reached. In the colours, {sense}.")
+        return Picture.of_file(
+            folder / name, title, f"{quantity.definition} Grey: not reached. In the colours, {sense}."
+        )
 
-    def _write_distances(self, folder: AnyFolder) -> Picture:
-        panels = []
-        for field, title, _ in DISTANCES:
-            values = getattr(self.evaluation, field)
-            known = np.isfinite(values)
-            place = title.removeprefix("distance between the arms ")
-            panels.append((place, known, values, f"not reached by each arm: {int((~known).sum())}"))
-        name, title = "map_arm_distance.png", "distance between the arms"
-        self._write_panels(folder / name, title, "distance [mm]\nmore is better", 1e3, panels, shared=False)
-        quantity = Quantity("", title, "mm", 1e3, 1, "_m", True, "")
-        text = "; ".join(f"{panel[0]}: {_spread(panel[2], quantity)}" for panel in panels)
-        return Picture.of_file(folder / name, "Distance between the arms", f"{text}. Grey: not reached by each arm.")
-
-    def _write_panels(
-        self, path: Path, heading: str, label: str, scale: float, panels: list[Panel], shared: bool = True
-    ) -> None:
-        """The organ as the camera sees it, once for each panel; a colour bar for all or for each."""
+    def _write_panels(self, path: Path, heading: str, label: str, scale: float, panels: list[Panel]) -> None:
+        """The organ as the camera sees it, once for each panel, with a colour bar for all."""
         from matplotlib import colormaps
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import to_rgb
         from matplotlib.figure import Figure
 
-        groups = [panels] if shared else [[panel] for panel in panels]
-        norms = [_norm(group, scale) for group in groups for _ in group]
+        norm = _norm(panels, scale)
         figure = Figure(
             figsize=(0.6 + 3.7 * len(panels), 4.15),
             dpi=DPI,
@@ -193,17 +159,13 @@ class ArmMaps:
         )
         row = figure.subplots(1, len(panels), squeeze=False)[0]
         grey = np.array(to_rgb(NEITHER))
-        for axes, norm, (title, mask, values, missed) in zip(row, norms, panels, strict=True):
+        for axes, (title, mask, values) in zip(row, panels, strict=True):
             tint = colormaps[COLOUR_MAP](norm(np.nan_to_num(values * scale)))[:, :3]
             dots = np.where(mask[:, None], tint, grey)
             colours = np.where(mask[self._nearest[:, :1]], self._painted(values * scale, mask, norm), grey)
             self._draw(axes, colours, dots, title)
-            axes.text(0.5, -0.02, missed, transform=axes.transAxes, ha="center", va="top", fontsize=8, color=INK)
-            if not shared:
-                figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=axes, shrink=0.6, pad=0.02, label=label)
-        if shared:
-            figure.colorbar(ScalarMappable(norms[0], COLOUR_MAP), ax=row, shrink=0.7, pad=0.02, label=label)
-        if not any(np.isfinite(values).any() for _, _, values, _ in panels):
+        figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=row, shrink=0.7, pad=0.02, label=label)
+        if not any(np.isfinite(values).any() for _, _, values in panels):
             heading = f"{heading}: nothing is reached"
         figure.suptitle(heading, fontsize=12, color=INK)
         save_png(figure, path)
@@ -246,19 +208,13 @@ def camera_view(evaluation: ArmsEvaluation) -> OrthographicView:
 
 
 def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: OrthographicView) -> None:
-    """Each port as a letter in a disc, and the way into the body from it as far as the organ's middle."""
-    from matplotlib.patheffects import withStroke
-
-    middle = evaluation.surface_points.mean(axis=0)
+    """Each port as a letter in a disc."""
     for name, port in evaluation.ports.items():
         letter, colour = PORT_MARKS[name]
-        start, into = np.array(port.point), np.array(port.into) / np.linalg.norm(port.into)
-        path = view.flat(np.stack([start, start + max(0.0, float((middle - start) @ into)) * into]))
-        halo = [withStroke(linewidth=3.2, foreground="white")]
-        axes.plot(*path.T, color=colour, lw=1.4, ls=(0, (4, 2)), zorder=4, path_effects=halo)
-        axes.plot(*path[0], "o", ms=12, color=colour, mec="white", mew=1.2, zorder=5)
+        place = view.flat(np.array([port.point]))[0]
+        axes.plot(*place, "o", ms=12, color=colour, mec="white", mew=1.2, zorder=5)
         axes.text(
-            path[0, 0], path[0, 1], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6
+            place[0], place[1], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6
         )
 
 
@@ -266,114 +222,42 @@ def _norm(panels: list[Panel], scale: float) -> Normalize:
     """From the least to the greatest value of the panels."""
     from matplotlib.colors import Normalize
 
-    known = np.concatenate([values[np.isfinite(values)] for _, _, values, _ in panels]) * scale
+    known = np.concatenate([values[np.isfinite(values)] for _, _, values in panels]) * scale
     least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     return Normalize(least, most if most > least else least + 1.0)
 
 
-def _misses(counts: list[tuple[str, int]]) -> str:
-    if not counts:
-        return "every point is reached"
-    return "grey, points:\n" + "\n".join(f"{reason}: {count}" for reason, count in counts)
-
-
-def _spread(values: FloatArray, quantity: Quantity) -> str:
-    least, _, greatest = spread(values)
-    if math.isnan(least):
-        return "no value"
-    return f"{quantity.text(least, with_unit=False)} to {quantity.text(greatest)}"
-
-
-def poses(evaluation: ArmsEvaluation) -> dict[str, int]:
-    """The point at which each arm is drawn: of those that both reach, beside their middle towards its own port."""
-    found = {}
-    for (side, arm), other in zip(sides(evaluation), SIDES[::-1], strict=True):
-        mask = evaluation.both if evaluation.both.any() else arm.reachable
-        known = np.flatnonzero(mask)
-        if not len(known):
-            continue
-        middle = evaluation.points[known].mean(axis=0)
-        apart = np.array(evaluation.ports[side].point) - np.array(evaluation.ports[other].point)
-        middle = middle + ASIDE * apart / np.linalg.norm(apart)
-        found[side] = int(known[np.argmin(np.linalg.norm(evaluation.points[known] - middle, axis=1))])
-    return found
-
-
-def draw_arms(evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], ports: Ports) -> dict[str, NDArray[np.uint8]]:
-    """Pictures (height, width, 3) by caption: from beside the table and through the endoscope's port.
+def draw_arms(evaluation: ArmsEvaluation, arms: Sequence[Arm], ports: Ports) -> NDArray[np.uint8]:
+    """A picture (720, 960, 3) of the arms at home in their ports, from beside the table.
 
     Raises:
         NoGLError: there is no OpenGL; names what is missing.
     """
-    from matplotlib.colors import to_rgba
-
-    places = poses(evaluation)
-    joints = [
-        reach.joints[places[side]] if side in places else arm.home
-        for (side, reach), arm in zip(sides(evaluation), arms, strict=True)
-    ]
-    capsules = [DrawnCapsule(ends, radius, to_rgba(colour)) for ends, radius, colour in _fittings(evaluation)]
-    if not ports.wall.plate:
-        # Not seen by the endoscope's camera, which stands inside the dome: OpenGL leaves out the backs of surfaces.
-        capsules.append(DrawnCapsule(np.stack([ports.dome_centre] * 2), ports.wall.radius, WALL))
-    line = np.array(ports.right.point) - np.array(ports.left.point)
-    point, target = np.array(ports.endoscope.point), np.array(ports.endoscope.target)
-    ahead = (target - point) / np.linalg.norm(target - point)
-    position, centre = _beside(evaluation, arms, joints, ports)
-    cameras = {
-        "The arms at their ports": Camera.looking(position, centre, ports.wall_normal, BESIDE_FOV),
-        # The right arm comes from the right.
-        "Through the endoscope": Camera.looking(point + SCOPE_TIP * ahead, target, np.cross(line, ahead), SCOPE_FOV),
-    }
     posed = [(arm.model, mujoco.MjData(arm.model)) for arm in arms]
-    for arm, (model, data), values in zip(arms, posed, joints, strict=True):
-        arm.write(data, values)
+    for arm, (model, data) in zip(arms, posed, strict=True):
+        arm.write(data, arm.home)
         mujoco.mj_kinematics(model, data)
-    surface = evaluation.surface_points, evaluation.surface_triangles
-    frames = draw_still(surface, posed, capsules, list(cameras.values()), SIZE)
-    return dict(zip(cameras, frames, strict=True))
-
-
-def _beside(
-    evaluation: ArmsEvaluation, arms: tuple[Arm, Arm], joints: list[FloatArray], ports: Ports
-) -> tuple[FloatArray, FloatArray]:
-    """A camera's position and target [m]: on the side away from the arms' bases, so far that it sees all shapes."""
-    ends = np.concatenate([arm.shape_ends(one).reshape(-1, 3) for arm, one in zip(arms, joints, strict=True)])
-    middle = evaluation.points[~evaluation.inner].mean(axis=0)
-    line = np.array(ports.right.point) - np.array(ports.left.point)
-    away = np.cross(line, ports.wall_normal)
-    away /= np.linalg.norm(away)
-    if (ends.mean(axis=0) - middle) @ away > 0.0:
+    capsules = [DrawnCapsule(np.array([port.point] * 2), PORT_RADIUS, PORT) for port in evaluation.ports.values()]
+    scope = evaluation.ports["endoscope"]
+    point, into = np.array(scope.point), np.array(scope.into) / np.linalg.norm(scope.into)
+    capsules.append(DrawnCapsule(np.stack([point - SCOPE_OUTSIDE * into, point]), SCOPE_RADIUS, SCOPE))
+    if not ports.wall.plate:
+        capsules.append(DrawnCapsule(np.stack([ports.dome_centre] * 2), ports.wall.radius, WALL))
+    ends = np.concatenate([arm.shape_ends(arm.home).reshape(-1, 3) for arm in arms])
+    line, up = np.array(ports.right.point) - np.array(ports.left.point), ports.wall_normal
+    away = np.cross(line, up) / np.linalg.norm(line)
+    # From the side away from the arms' bases.
+    if (ends.mean(axis=0) - evaluation.surface_points.mean(axis=0)) @ away > 0.0:
         away = -away
-    everything = np.concatenate([ends, middle[None]])
-    centre = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
-    radius = float(np.linalg.norm(everything - centre, axis=1).max())
-    direction = 0.88 * away + 0.48 * ports.wall_normal + 0.15 * line / np.linalg.norm(line)
-    direction /= np.linalg.norm(direction)
-    return centre + 1.05 * radius / np.sin(np.radians(0.5 * BESIDE_FOV)) * direction, centre
+    seen = np.concatenate([ends, evaluation.surface_points])
+    camera = filling(seen, 0.88 * away + 0.48 * up, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
+    surface = evaluation.surface_points, evaluation.surface_triangles
+    return draw_still(surface, posed, capsules, [camera], SIZE)[0]
 
 
-def _fittings(evaluation: ArmsEvaluation) -> list[tuple[FloatArray, float, str]]:
-    """Ends [m] (2, 3), radius [m] and colour of the ports and the endoscope."""
-    found = []
-    for name, port in evaluation.ports.items():
-        point, into = np.array(port.point), np.array(port.into) / np.linalg.norm(port.into)
-        found.append((np.stack([point, point]), PORT_RADIUS, PORT))
-        if name == "endoscope":
-            found.append((np.stack([point - SCOPE_OUTSIDE * into, point]), SCOPE_RADIUS, SCOPE))
-    return found
-
-
-def write_images(
-    pictures: Mapping[str, NDArray[np.uint8]], folder: AnyFolder, *, name: str, description: str
-) -> list[Picture]:
-    """Write RGB images by caption as PNG files, numbered from 1, with a description of all."""
+def write_picture(image: NDArray[np.uint8], path: Path) -> Picture:
+    """Write the picture of the arms as a PNG file."""
     from matplotlib.image import imsave
 
-    written = []
-    for number, (caption, image) in enumerate(pictures.items(), start=1):
-        path = folder / f"{name}_{number}.png"
-        imsave(path, np.ascontiguousarray(image), format="png")
-        title = caption[0].upper() + caption[1:]
-        written.append(Picture.of_file(path, title, description))
-    return written
+    imsave(path, np.ascontiguousarray(image), format="png")
+    return Picture.of_file(path, "The arms at their ports", "Both arms at home, the endoscope, the ports and the wall.")

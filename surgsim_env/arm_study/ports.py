@@ -63,11 +63,6 @@ class InnerTarget:
     """A point inside the patient that both arms should reach [m]."""
 
     point: Vector
-    name: str = "target"
-
-    def __post_init__(self) -> None:
-        if not np.isfinite(self.point).all():
-            raise ValueError(f"target {self.name!r} is at {self.point}; every number must be finite")
 
 
 @dataclass(frozen=True)
@@ -79,14 +74,12 @@ class Wall:
         hole: distance from a trocar within which shapes may pass [m].
         radius: of the dome [m]; 20 cm is chosen for an insufflated abdomen.
         plate: an infinite plate instead of the dome.
-        normal: out of the body; found from the ports where none is given.
     """
 
     thickness: float = 0.02
     hole: float = 0.03
     radius: float = 0.20
     plate: bool = False
-    normal: Vector | None = None
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.thickness < math.inf and 0.5 * self.thickness < self.hole < math.inf):
@@ -94,22 +87,17 @@ class Wall:
                 f"wall: thickness {self.thickness:g} m, hole {self.hole:g} m; the rule is "
                 "0 <= thickness < 2 hole, finite"
             )
-        if not self.thickness < self.radius < math.inf:
-            raise ValueError(f"wall.radius is {self.radius:g} m; it must be finite and above the thickness")
-        if self.normal is not None and not (np.isfinite(self.normal).all() and any(self.normal)):
-            raise ValueError(f"wall.normal is {self.normal}; it must be a direction such as [0, 0, 1]")
 
 
 @dataclass(frozen=True)
 class Ports:
-    """A ports file: two instruments, the endoscope, inner targets and the wall; `name` is the file's stem."""
+    """A ports file: two instruments, the endoscope, inner targets and the wall."""
 
     left: PortPlace
     right: PortPlace
     endoscope: EndoscopePort
     targets: tuple[InnerTarget, ...] = ()
     wall: Wall = Wall()
-    name: str = "ports"
 
     def __post_init__(self) -> None:
         if math.dist(self.left.point, self.right.point) < 1e-3:
@@ -130,17 +118,14 @@ class Ports:
 
     @property
     def wall_normal(self) -> FloatArray:
-        """Out of the body (3,): across the line of both ports, as given or against their mean direction inwards."""
+        """Out of the body (3,): across the line of both ports, against their mean direction inwards."""
         line = np.array(self.right.point) - np.array(self.left.point)
         line /= np.linalg.norm(line)
-        given = self.wall.normal
-        out = self.left.port.rotation[:, 2] + self.right.port.rotation[:, 2] if given is None else np.array(given)
+        out = self.left.port.rotation[:, 2] + self.right.port.rotation[:, 2]
         out = out - (out @ line) * line
         length = float(np.linalg.norm(out))
         if length < 1e-6:
-            raise ValueError(
-                "the wall's normal lies along the line of the ports, which defines no wall: give wall.normal"
-            )
+            raise ValueError("both ports point along the line through them, which defines no wall: turn them")
         return out / length
 
     @property
@@ -156,10 +141,8 @@ class Ports:
         Raises:
             ValueError: names the port, its place and the organ.
         """
-        mesh = anatomy.mesh
-        organ = f"scene {anatomy.scene.name!r}", mesh.points, mesh.boundary_triangles
         for name, port in self.frames.items():
-            check_port_outside(port, *organ, what=f"the {name} port")
+            check_port_outside(port, anatomy, what=f"the {name} port")
 
 
 def read_ports(path: str | Path) -> Ports:
@@ -173,7 +156,7 @@ def read_ports(path: str | Path) -> Ports:
 
 def ports_from_table(table: dict[str, Any], *, name: str) -> Ports:
     """Ports from a table such as a TOML file holds."""
-    return fill(Ports, {"name": name, **table}, f"ports {name!r}")
+    return fill(Ports, table, f"ports {name!r}")
 
 
 def default_ports(anatomy: Anatomy) -> Ports:
@@ -191,7 +174,6 @@ def default_ports(anatomy: Anatomy) -> Ports:
         left=PortPlace(_vector(camera - PORT_SPACING * aside), target=_vector(target)),
         right=PortPlace(_vector(camera + PORT_SPACING * aside), target=_vector(target)),
         endoscope=EndoscopePort(_vector(camera), _vector(target)),
-        name="default",
     )
 
 

@@ -11,16 +11,16 @@ from surgsim_env.arm_study.clearance import Obstacles, arm_distances
 from surgsim_env.arm_study.joint_search import (
     REACHED,
     Candidates,
+    across,
     approach_directions,
-    approach_share,
+    directions_met,
     from_directions,
     from_neighbours,
     from_starts,
     spread_starts,
-    still_open,
 )
 from surgsim_env.arm_study.kinematics import BatchKinematics, Chain, cross, dot
-from surgsim_env.arm_study.results import ArmReach, Touch
+from surgsim_env.arm_study.results import ArmReach
 
 # Number of candidates whose clearance is computed at once.
 CANDIDATES_AT_ONCE = 20_000
@@ -86,7 +86,7 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles)
     found, clear = search.all_around(found, search.clear(found))
     usable = _every(clear)
     reason = _reasons(search, found, clear)
-    report = _report(search, found, usable, reason, _touches(search, found, clear, reason))
+    report = _report(search, found, usable, reason)
     return Reach(report, kinematics, found, usable)
 
 
@@ -107,7 +107,8 @@ class _Search:
                 # Where none is usable, the second round too begins at candidates that meet the point.
                 usable = _every(clear)
                 begin = np.where(np.any(usable, axis=1, keepdims=True), usable, found.met)
-            wanted = still_open(self.directions, found, _every(clear)) & np.any(found.met, axis=1, keepdims=True)
+            lacking = ~directions_met(found.pointing, _every(clear), self.directions)
+            wanted = lacking & np.any(found.met, axis=1, keepdims=True)
             rows = np.flatnonzero(np.any(wanted, axis=1))
             more = _empty_like(found, self.directions.shape[1])
             if rows.size:
@@ -171,30 +172,7 @@ def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> In
     return reason.astype(np.int32)
 
 
-def _touches(search: _Search, found: Candidates, clear: NDArray[np.bool_], reason: IntArray) -> tuple[Touch, ...]:
-    """Which parts touch the organ (reason 4) or the wall (5), with the candidate that comes nearest to the point."""
-    kinematics, touches = search.kinematics, []
-    error = found.position_error + found.trocar_error
-    for index, tried in ((4, clear[0]), (5, _every(clear[:2]))):
-        rows = np.flatnonzero(reason == index)
-        nearest = np.argmin(np.where(tried[rows], error[rows], np.inf), axis=1)
-        count = np.zeros(len(kinematics.arm.shape_names), dtype=np.int64)
-        for low in range(0, len(rows), CANDIDATES_AT_ONCE):
-            part = slice(low, low + CANDIDATES_AT_ONCE)
-            chain = kinematics.at(found.joints[rows[part], nearest[part]])
-            if index == 4:
-                gaps = search.around.organ_gaps(kinematics, chain, exact=False)
-            else:
-                gaps = search.around.wall_gaps(kinematics, chain)
-            count += (gaps < 0.0).sum(axis=0)
-        order = np.argsort(-count, kind="stable")
-        touches += [Touch(index, kinematics.arm.shape_names[s], int(count[s])) for s in order if count[s]]
-    return tuple(touches)
-
-
-def _report(
-    search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray, touches: tuple[Touch, ...]
-) -> ArmReach:
+def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
     kinematics, sites, around = search.kinematics, search.sites, search.around
     rows, good = np.arange(len(reason)), reason == 0
     worth = np.where(usable, limit_margin(kinematics, found.joints), -np.inf)
@@ -216,7 +194,7 @@ def _report(
         reason=reason,
         joints=joints,
         position_error=found.position_error[rows, best],
-        approach_share=where_reached(approach_share(found.pointing, usable, search.directions)),
+        approach_share=where_reached(directions_met(found.pointing, usable, search.directions).mean(axis=1)),
         manipulability=where_reached(manipulability(values)),
         isotropy=where_reached(isotropy(values)),
         limit_margin=where_reached(limit_margin(kinematics, joints)),
@@ -226,7 +204,6 @@ def _report(
         organ_clearance=organ,
         wall_clearance=where_reached(around.wall_clearance(kinematics, chain)),
         trocar_error=where_reached(kinematics.trocar_error(chain)),
-        touches=touches,
     )
 
 
@@ -298,9 +275,7 @@ def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatAr
     jacobian = np.concatenate([linear, CHARACTERISTIC_LENGTH * angular], axis=1)
     freedoms = kinematics.arm.joint_count
     if not kinematics.arm.remote_centre_fixed:
-        shaft = kinematics.shaft_jacobian(chain)
-        across = shaft - chain.along[:, :, None] * np.einsum("ni,nij->nj", chain.along, shaft)[:, None]
-        idle = np.linalg.svd(across)[2][:, 2:]
+        idle = np.linalg.svd(across(kinematics.shaft_jacobian(chain), chain.along))[2][:, 2:]
         jacobian, freedoms = jacobian @ np.swapaxes(idle, 1, 2), freedoms - 2
     values: FloatArray = np.asarray(np.linalg.svd(jacobian, compute_uv=False), dtype=np.float64)
     return values[:, : min(6, freedoms)]

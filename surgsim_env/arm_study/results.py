@@ -2,10 +2,10 @@
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,6 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.scene.model import Port
 
 SIDES = ("left", "right")
-# Called with the current work in words and the share of the whole that is done.
-Tell = Callable[[str, float], None]
 # Reasons why an arm does not reach a point, in the order of the tests; 0 is reachable.
 REASONS = ("reachable", "no joints put the tip there", "a joint limit", "the shaft misses its trocar",
            "the arm touches the organ", "the arm touches the wall")  # fmt: skip
@@ -25,14 +23,6 @@ RANKING_RULE = (
     "clearance from organ and body wall in whole millimetres, then by the smallest tip force in tenths of a newton, "
     "always the largest first; then as given."
 )
-
-
-class Touch(NamedTuple):
-    """A part of an arm that keeps it from points: index into REASONS, the part's name, the number of points."""
-
-    reason: int
-    part: str
-    points: int
 
 
 @dataclass(frozen=True)
@@ -54,7 +44,6 @@ class ArmReach:
         organ_clearance: smallest distance of shaft and links from the organ [m]             (n_point,)
         wall_clearance: smallest distance of shaft and links from the body wall [m]          (n_point,)
         trocar_error: distance of the shaft's axis from the trocar [m]                       (n_point,)
-        touches: parts that touch organ or wall where that is the reason, the most frequent first
     """
 
     name: str
@@ -71,7 +60,6 @@ class ArmReach:
     organ_clearance: FloatArray
     wall_clearance: FloatArray
     trocar_error: FloatArray
-    touches: tuple[Touch, ...] = ()
 
     @property
     def reachable(self) -> NDArray[np.bool_]:
@@ -81,7 +69,7 @@ class ArmReach:
 
 @dataclass(frozen=True)
 class ArmThroughCycle:
-    """One arm while the organ moves, at every point, at the positions of `ThroughCycle` and the instants of its `time`.
+    """One arm while the organ moves, at every point and position.
 
     What is along a path is NaN where the arm has none: it begins at rest where the arm reaches the point, keeps joint
     limits and trocar at every position, and touches neither organ nor wall.
@@ -90,21 +78,11 @@ class ArmThroughCycle:
         reachable: at each position by itself, whatever the joints before      (n_position, n_point)
         joints: along the path [m, rad]                                        (n_position, n_point, n_joint)
         clearance: smallest distance from organ and wall along the path [m]    (n_position, n_point)
-        speed: largest of each joint [rad/s or m/s]                            (n_point, n_joint)
-        speed_share: largest share of a speed limit over all points and joints (n_instant,)
-        joint_names: base to tip
-        hinge: whether a joint turns or slides                                 (n_joint,)
-        speed_limit: [rad/s or m/s]                                            (n_joint,)
     """
 
     reachable: NDArray[np.bool_]
     joints: FloatArray
     clearance: FloatArray
-    speed: FloatArray
-    speed_share: FloatArray
-    joint_names: tuple[str, ...]
-    hinge: NDArray[np.bool_]
-    speed_limit: FloatArray
 
     @property
     def always(self) -> NDArray[np.bool_]:
@@ -116,24 +94,6 @@ class ArmThroughCycle:
         """Which points the arm has a path for, (n_point,)."""
         return np.isfinite(self.joints[0, :, 0])
 
-    @property
-    def joint_share(self) -> FloatArray:
-        """Each joint's largest speed as a share of its limit, (n_point, n_joint)."""
-        return self.speed / self.speed_limit
-
-    @property
-    def follows(self) -> NDArray[np.bool_]:
-        """Which points the arm can follow: it has a path, and no joint is too slow for it, (n_point,)."""
-        return self.has_path & (np.nan_to_num(self.joint_share, nan=np.inf) <= 1.0).all(axis=1)
-
-    @property
-    def limiting(self) -> tuple[str, float]:
-        """The joint with the largest share of its speed limit, and that share; "" and NaN without a path."""
-        if not self.has_path.any():
-            return "", math.nan
-        most = np.nanmax(self.joint_share, axis=0)
-        return self.joint_names[int(most.argmax())], float(most.max())
-
 
 @dataclass(frozen=True)
 class ThroughCycle:
@@ -143,9 +103,6 @@ class ThroughCycle:
         motions: their names, the one that moves the organ most first
         travel: largest displacement of any point by each motion [m]                  (n_motion,)
         period: of each [s]                                                           (n_motion,)
-        level: share of each motion's top at each position, in the order of `motions` (n_position, n_motion)
-        time: instants of a cycle of the first motion [s]                             (n_instant,)
-        course: share of its top then                                                 (n_instant,)
         left, right: each arm
         both: reachable by both at once at each position                              (n_position, n_point)
     """
@@ -153,9 +110,6 @@ class ThroughCycle:
     motions: tuple[str, ...]
     travel: FloatArray
     period: FloatArray
-    level: FloatArray
-    time: FloatArray
-    course: FloatArray
     left: ArmThroughCycle
     right: ArmThroughCycle
     both: NDArray[np.bool_]
@@ -170,11 +124,6 @@ class ThroughCycle:
         """Which points both reach at once at every position, (n_point,)."""
         return np.asarray(self.both.all(axis=0))
 
-    @property
-    def alone(self) -> NDArray[np.bool_]:
-        """Positions at which all motions but the first rest, from rest to its top, (n_position,)."""
-        return np.asarray((self.level[:, 1:] == 0.0).all(axis=1))
-
 
 @dataclass(frozen=True)
 class ArmsEvaluation:
@@ -187,12 +136,11 @@ class ArmsEvaluation:
         both: reachable by both at once, the arms at least 5 mm apart                         (n_point,)
         arm_distance_inside, arm_distance_outside: smallest distance between the arms inside and outside the body
             with both tips at the point's neighbourhood [m], NaN where not both reach it      (n_point,)
-        summary: shares, extremes, versions, seed and inputs, as in summary.json, plain JSON types
         scene: name of the scene
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
-        pictures: RGB images (height, width, 3) uint8 of the arms in the patient, by caption
         ports: where the arms ("left", "right") and the camera ("endoscope") enter
         cycle: both arms while the patient breathes; None for one who holds still
+        picture: of the arms in the patient, RGB, (height, width, 3) uint8; None without one
     """
 
     points: FloatArray
@@ -203,13 +151,12 @@ class ArmsEvaluation:
     both: NDArray[np.bool_]
     arm_distance_inside: FloatArray
     arm_distance_outside: FloatArray
-    summary: Mapping[str, Any]
     scene: str
     surface_points: FloatArray
     surface_triangles: IntArray
-    pictures: Mapping[str, NDArray[np.uint8]]
     ports: Mapping[str, Port]
     cycle: ThroughCycle | None = None
+    picture: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -255,8 +202,7 @@ QUANTITIES = (
              "are left out."),
     Quantity("wall_clearance", "clearance from the body wall", "mm", 1e3, 1, "_m", True,
              "Smallest distance between the arm's surface and the body wall, a dome or plate through the ports; "
-             "parts in the hole about the arm's own port are left out. summary.json lists the sizes of wall "
-             "and hole."),
+             "parts in the hole about the arm's own port are left out."),
     Quantity("approach_share", "approach directions", "%", 100.0, 0, "", True,
              "Share of 32 directions, spread evenly over the half space above the surface, from which the tip can "
              "come to the point within 10 degrees."),
@@ -309,14 +255,6 @@ class Spread(NamedTuple):
         return least, median, greatest
 
 
-class Extreme(NamedTuple):
-    """A least value [SI] with its arm and point; NaN, "" and -1 where there is none."""
-
-    value: float
-    side: str
-    point: int
-
-
 def number_text(value: float, scale: float = 1.0, digits: int | None = 1, unit: str = "") -> str:
     """A number rounded for reading, with its unit; a dash for NaN."""
     if not math.isfinite(value):
@@ -359,33 +297,6 @@ def worse_of_both(evaluation: ArmsEvaluation, quantity: Quantity) -> FloatArray:
     return np.where(evaluation.both, pair.min(axis=0) if quantity.more_is_better else pair.max(axis=0), np.nan)
 
 
-def extreme(evaluation: ArmsEvaluation, field: str) -> Extreme:
-    """The least finite value of a field of ArmReach over both arms and all points that they reach."""
-    found = Extreme(math.nan, "", -1)
-    for side, arm in sides(evaluation):
-        values = np.where(arm.reachable & np.isfinite(getattr(arm, field)), getattr(arm, field), np.nan)
-        if np.isnan(values).all():
-            continue
-        index = int(np.nanargmin(values))
-        value = float(values[index])
-        if not found.side or value < found.value:
-            found = Extreme(value, side, index)
-    return found
-
-
-def worst_clearance(evaluation: ArmsEvaluation) -> tuple[Extreme, str]:
-    """The smallest clearance of either arm from organ or wall, and from which of them."""
-    organ, wall = extreme(evaluation, "organ_clearance"), extreme(evaluation, "wall_clearance")
-    return (wall, "the body wall") if organ.side == "" or wall.value < organ.value else (organ, "the organ")
-
-
-def reason_counts(arm: ArmReach) -> list[tuple[str, int]]:
-    """Reasons why points are not reached with the number of points, the most frequent first."""
-    counts = np.bincount(arm.reason, minlength=len(REASONS))[1:]
-    order = sorted(range(len(counts)), key=lambda index: (-counts[index], index))
-    return [(REASONS[index + 1], int(counts[index])) for index in order if counts[index]]
-
-
 def clearances(evaluation: ArmsEvaluation) -> FloatArray:
     """The smaller of the distances from organ and wall of either arm at every point that it reaches [m], (n,)."""
     parts = [
@@ -396,58 +307,22 @@ def clearances(evaluation: ArmsEvaluation) -> FloatArray:
 
 
 def verdict(evaluation: ArmsEvaluation) -> str:
-    """The first paragraph of a report: shares, worst clearance, smallest tip force, most frequent obstacles."""
+    """The first paragraph of a report: the shares of points that each arm and both at once reach."""
     inner, outer = evaluation.inner, ~evaluation.inner
     left, right = (share_text(arm.reachable[outer]) for _, arm in sides(evaluation))
-    said = [
+    said = (
         f"Of {int(outer.sum())} points on the surface of {evaluation.scene} that face the ports, the left arm reaches "
         f"{left}, the right arm {right}, and both at once {share_text(evaluation.both[outer])}."
-    ]
-    if inner.any():
-        reached = int(evaluation.both[inner].sum())
-        if inner.sum() == 1:
-            said.append(f"{'Both' if reached else 'Not both'} reach the target inside it at once.")
-        else:
-            said.append(f"Of {int(inner.sum())} targets inside it both at once reach {reached}.")
-    if not (evaluation.left.reachable.any() or evaluation.right.reachable.any()):
-        said.append("There are no clearances and forces to report.")
-    else:
-        clearance, what = worst_clearance(evaluation)
-        if clearance.side:
-            distance = number_text(clearance.value, 1e3, 1, "mm")
-            usual = number_text(spread(clearances(evaluation)).median, 1e3, 1, "mm")
-            said.append(
-                f"The worst clearance is {distance}, between the {clearance.side} arm and {what}; the median is "
-                f"{usual}."
-            )
-        force = extreme(evaluation, "tip_force")
-        if force.side:
-            said.append(
-                f"The smallest tip force is {number_text(force.value, 1.0, 2, 'N')} ({force.side} arm): this force is "
-                "available wherever an arm reaches."
-            )
-    obstacles = [
-        f"the {side} arm most often because {_because(arm, counts[0][0])} ({counts[0][1]} points)"
-        for side, arm in sides(evaluation)
-        if (counts := reason_counts(arm))
-    ]
-    if obstacles:
-        said.append(f"Points are missed by {', by '.join(obstacles)}.")
-    return " ".join(said)
-
-
-def _because(arm: ArmReach, reason: str) -> str:
-    if reason == REASONS[2]:
-        return f"of {reason}"
-    parts = [touch.part for touch in arm.touches if REASONS[touch.reason] == reason]
-    return f"{reason} with {parts[0]}" if parts else reason
+    )
+    if not inner.any():
+        return said
+    return f"{said} Of {int(inner.sum())} targets inside it both at once reach {int(evaluation.both[inner].sum())}."
 
 
 @dataclass(frozen=True)
 class Ranked:
     """A row of the ranking; shares 0 to 1, median clearance [m], smallest force [N], NaN where nothing is reached."""
 
-    place: int
     name: str
     what: str
     left: float
@@ -455,12 +330,11 @@ class Ranked:
     both: float
     either: float
     clearance: float
-    worst_clearance: float
     force: float
 
 
 # Columns of points.csv of each arm while the patient breathes.
-CYCLE_COLUMNS = ("always", "follows", "path_clearance_worst_m", "speed_share", "speed_joint")
+CYCLE_COLUMNS = ("always", "has_path", "path_clearance_worst_m")
 
 
 def columns(evaluation: ArmsEvaluation) -> list[str]:
@@ -501,10 +375,7 @@ def _cycle_cells(cycle: ThroughCycle, index: int) -> list[str]:
     """The cells of a point under CYCLE_COLUMNS for each arm, and whether both reach it at every position."""
     cells = []
     for _, arm in cycle.arms:
-        share = arm.joint_share[index]
-        cells += [str(int(arm.always[index])), str(int(arm.follows[index]))]
-        cells += [_cell(arm.clearance[:, index].min()), _cell(share.max())]
-        cells.append(arm.joint_names[int(share.argmax())] if arm.has_path[index] else "")
+        cells += [str(int(arm.always[index])), str(int(arm.has_path[index])), _cell(arm.clearance[:, index].min())]
     return [*cells, str(int(cycle.both_always[index]))]
 
 
@@ -514,8 +385,7 @@ def rank(candidates: Sequence[tuple[str, str, ArmsEvaluation]]) -> list[Ranked]:
     Args:
         candidates: name, description in a few words, and evaluation of each.
     """
-    ordered = sorted((_row(*one) for one in candidates), key=_rank_key)
-    return [replace(row, place=place) for place, row in enumerate(ordered, start=1)]
+    return sorted((_row(*one) for one in candidates), key=_rank_key)
 
 
 def _row(name: str, what: str, evaluation: ArmsEvaluation) -> Ranked:
@@ -523,9 +393,8 @@ def _row(name: str, what: str, evaluation: ArmsEvaluation) -> Ranked:
     together = evaluation.both if evaluation.cycle is None else evaluation.cycle.both_always
     masks = (by_left, by_right, together, by_left | by_right)
     left, right, both, either = (float(mask[outer].mean()) if outer.any() else 0.0 for mask in masks)
-    usual, (worst, _) = spread(clearances(evaluation)).median, worst_clearance(evaluation)
-    force = extreme(evaluation, "tip_force").value
-    return Ranked(0, name, what, left, right, both, either, usual, worst.value, force)
+    force = spread(np.concatenate([arm.tip_force[arm.reachable] for _, arm in sides(evaluation)])).least
+    return Ranked(name, what, left, right, both, either, spread(clearances(evaluation)).median, force)
 
 
 def _rank_key(row: Ranked) -> tuple[float, ...]:

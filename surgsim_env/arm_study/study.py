@@ -1,34 +1,18 @@
 """Two arms on a patient's anatomy: reach, dexterity and clearances evaluated; setups ranked; report and files."""
 
-import json
-import platform
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.arm_study.clearance import ClusteredSurface, Obstacles
-from surgsim_env.arm_study.episodes import (
-    MEASURES,
-    Episodes,
-    clause,
-    median_of,
-    plain_episodes,
-    run_episodes,
-    what_was_run,
-)
-from surgsim_env.arm_study.following import make_cycle
 from surgsim_env.arm_study.kinematics import BatchKinematics
-from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_images
-from surgsim_env.arm_study.ports import InnerTarget, Ports, default_ports, read_ports
+from surgsim_env.arm_study.pictures import ArmMaps, draw_arms, write_picture
+from surgsim_env.arm_study.ports import Ports, default_ports, read_ports
 from surgsim_env.arm_study.reach import (
     Sites,
     evaluate_both,
@@ -42,11 +26,8 @@ from surgsim_env.arm_study.results import (
     REASONS,
     SHARE_DEFINITIONS,
     SIDES,
-    ArmReach,
     ArmsEvaluation,
     Ranked,
-    Tell,
-    extreme,
     number_text,
     rank,
     share_text,
@@ -55,19 +36,10 @@ from surgsim_env.arm_study.results import (
     values_of,
     verdict,
     worse_of_both,
-    worst_clearance,
     write_points,
 )
-from surgsim_env.arm_study.through_cycle import (
-    PICTURE_NAME,
-    cycle_clause,
-    cycle_section,
-    cycle_summary,
-    draw_cycle,
-    evaluate_cycle,
-)
-from surgsim_env.instruments.arm.arm import Arm, load_arm
-from surgsim_env.palpation.job import package_version, plain_json
+from surgsim_env.arm_study.through_cycle import cycle_section, evaluate_cycle
+from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.reports.html_page import Picture, render_page
 from surgsim_env.reports.output_folder import AnyFolder
@@ -79,13 +51,11 @@ from surgsim_env.scene.model import Scene
 
 # Places from which each point is chosen.
 PLACES_PER_POINT = 12
-REPORT_NAME, POINTS_NAME, SUMMARY_NAME = "report.html", "points.csv", "summary.json"
-# Every file that a study can write; which pictures there are depends on the arms, the episodes and OpenGL.
+REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
+# Every file that a study can write; which pictures there are depends on the arms and OpenGL.
 RESULT_NAMES = (
-    *(REPORT_NAME, POINTS_NAME, SUMMARY_NAME, "map_reach.png", "map_arm_distance.png"),
-    PICTURE_NAME,
+    *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, "map_reach.png"),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
-    *("arms_1.png", "arms_2.png", "episode_1.png"),
 )
 Rows = list[tuple[str, ...]]
 
@@ -98,8 +68,8 @@ def evaluate_arms(
     *,
     seed: int = 0,
     count: int = 500,
-    progress: Tell | None = None,
-    pictures: bool = False,
+    progress: StepProgress | None = None,
+    picture: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
 
@@ -112,14 +82,13 @@ def evaluate_arms(
         ports: a ports file, or the result of `read_ports`; `default_ports` where none is given.
         seed: draws the first point of the surface.
         count: number of points of the surface.
-        progress: called with the current work and the share that is done.
-        pictures: whether to draw the arms in the patient; without OpenGL there are none, `progress` gets the reason.
+        progress: shows the steps.
+        picture: whether to draw the arms in the patient; without OpenGL there is none, `progress` says why.
 
     Raises:
         ValueError: one line with what is wrong in scene, arm or ports, and the way out.
     """
-    tell = progress or (lambda _what, _share: None)
-    tell("reading the scene", 0.0)
+    progress = progress or StepProgress()
     if not isinstance(scene, Anatomy):
         scene = load_anatomy(scene if isinstance(scene, Scene) else make_scene(scene))
     anatomy, mesh = scene, scene.mesh
@@ -134,60 +103,38 @@ def evaluate_arms(
     )
     sites = _sites(anatomy, where, count, seed)
     organ, reaches, around = ClusteredSurface(mesh.points, mesh.boundary_triangles), [], []
-    # A patient who breathes is evaluated at several positions, of which the first is at rest.
-    motions = anatomy.scene.motions
-    at_rest = 1.0 / len(make_cycle(motions).level) if motions else 1.0
-    for index, arm in enumerate(arms):
-        tell(f"the {SIDES[index]} arm at {len(sites.points)} points", at_rest * (0.05 + 0.4 * index))
-        kinematics = BatchKinematics(arm)
-        around.append(Obstacles(organ, where, tip_ball(kinematics)))
-        reaches.append(evaluate_reach(kinematics, sites, around[-1]))
-    tell("both arms at once", at_rest * 0.85)
-    both = evaluate_both(reaches[0], reaches[1], sites.points)
+    for side, arm in zip(SIDES, arms, strict=True):
+        with progress.step(f"the {side} arm at {len(sites.points)} points"):
+            kinematics = BatchKinematics(arm)
+            around.append(Obstacles(organ, where, tip_ball(kinematics)))
+            reaches.append(evaluate_reach(kinematics, sites, around[-1]))
+    with progress.step("both arms at once"):
+        both = evaluate_both(reaches[0], reaches[1], sites.points)
     cycle = None
-    if motions:
-        cycle = evaluate_cycle(
-            (reaches[0], reaches[1]),
-            both,
-            sites,
-            (around[0], around[1]),
-            anatomy,
-            lambda what, share: tell(what, at_rest + (0.95 - at_rest) * share),
-        )
-    reports = reaches[0].report, reaches[1].report
-    inputs = {
-        "scene": anatomy.scene.name,
-        **{side: report.name for side, report in zip(SIDES, reports, strict=True)},
-        "ports": asdict(where),
-        "count": count,
-        "seed": seed,
-    }
-    points, triangles = anatomy.outer_surface
+    if anatomy.scene.motions:
+        obstacles = around[0], around[1]
+        cycle = evaluate_cycle((reaches[0], reaches[1]), both, sites, obstacles, anatomy, progress)
+    surface, triangles = anatomy.outer_surface
     found = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
         inner=sites.inner,
-        left=reports[0],
-        right=reports[1],
+        left=reaches[0].report,
+        right=reaches[1].report,
         both=both.reachable,
         arm_distance_inside=both.inside,
         arm_distance_outside=both.outside,
-        summary={},
         scene=anatomy.scene.name,
-        surface_points=points,
+        surface_points=surface,
         surface_triangles=triangles,
-        pictures={},
         ports=where.frames,
         cycle=cycle,
     )
-    found = replace(found, summary=_summary(found, where.targets, inputs))
-    if pictures:
-        tell("pictures", 0.95)
+    if picture:
         try:
-            found = replace(found, pictures=draw_arms(found, (arms[0], arms[1]), where))
+            found = replace(found, picture=draw_arms(found, arms, where))
         except NoGLError as error:
-            tell(f"no pictures: {error}", 0.95)
-    tell("done", 1.0)
+            progress.say(f"no picture: {error}")
     return found
 
 
@@ -213,10 +160,8 @@ def facing_points(anatomy: Anatomy, ports: ArrayLike, count: int, seed: int) -> 
     next point is the one furthest from all before it (farthest-point sampling), the first drawn from the seed.
 
     Raises:
-        ValueError: fewer than one point asked for, or no triangle faces the ports.
+        ValueError: no triangle faces the ports.
     """
-    if count < 1:
-        raise ValueError(f"{count} points of the surface asked for; at least 1 is needed")
     corners = anatomy.mesh.points[anatomy.mesh.boundary_triangles]
     held = np.isin(anatomy.mesh.boundary_triangles, anatomy.anchors).all(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -253,183 +198,71 @@ def _spread(points: FloatArray, count: int, first: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def _summary(found: ArmsEvaluation, targets: Sequence[InnerTarget], inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Shares, extremes, targets, versions and inputs; SI units; the same run gives the same text."""
-    outer, left, right = ~found.inner, found.left, found.right
-    reached = {
-        "left": left.reachable,
-        "right": right.reachable,
-        "either": left.reachable | right.reachable,
-        "both": found.both,
-    }
-    (clearance, what), force = worst_clearance(found), extreme(found, "tip_force")
-    summary = {
-        "points": int(outer.sum()),
-        "reachable": {name: float(mask[outer].mean()) for name, mask in reached.items()},
-        "left": _arm_summary(left, outer),
-        "right": _arm_summary(right, outer),
-        "arm_distance_inside": spread(found.arm_distance_inside[outer])._asdict(),
-        "arm_distance_outside": spread(found.arm_distance_outside[outer])._asdict(),
-        "worst_clearance": {"value_m": clearance.value, "arm": clearance.side, "from": what, "point": clearance.point},
-        "smallest_tip_force": {"value_N": force.value, "arm": force.side, "point": force.point},
-        "targets": [
-            {
-                "name": target.name,
-                "point": target.point,
-                "left": REASONS[left.reason[row]],
-                "right": REASONS[right.reason[row]],
-                "both": found.both[row],
-            }
-            for row, target in zip(np.flatnonzero(found.inner), targets, strict=True)
-        ],
-        "versions": {
-            "surgsim": package_version(),
-            "python": platform.python_version(),
-            **{name: version(name) for name in ("numpy", "scipy", "mujoco")},
-        },
-        "inputs": inputs,
-        **cycle_summary(found),
-    }
-    return plain_json(summary, digits=12)
-
-
-def _arm_summary(arm: ArmReach, outer: np.ndarray) -> dict[str, Any]:
-    counts = {reason: int((arm.reason[outer] == index).sum()) for index, reason in enumerate(REASONS)}
-    return {
-        "arm": arm.name,
-        "reasons": counts,
-        "touches": [{"reason": REASONS[one.reason], "part": one.part, "points": one.points} for one in arm.touches],
-        **{one.field: spread(getattr(arm, one.field)[outer])._asdict() for one in QUANTITIES},
-    }
-
-
 @dataclass(frozen=True)
 class ArmSetup:
     """Two arms at their ports.
 
     Fields:
         name, what: as a ranking shows them
-        left, right: the arms, placed
+        left, right: descriptions of the arms
         ports: theirs and the endoscope's
     """
 
     name: str
     what: str
-    left: Arm
-    right: Arm
+    left: ArmDescription
+    right: ArmDescription
     ports: Ports
 
 
-@dataclass(frozen=True)
-class StudyPlan:
-    """How a study is run.
-
-    Fields:
-        points: number of points of the organ to be tried
-        seed: of the points, of the searches for joints, and of the first episode
-        episodes: number of episodes of the oracle script
-        instruments: the first setup's left and right arm, each a name or a TOML file, for the episodes
-        command: the command line, for the report and the summary
-    """
-
-    points: int
-    seed: int
-    episodes: int
-    instruments: tuple[str, str]
-    command: str
-
-
 def run_study(
-    setups: Sequence[ArmSetup], anatomy: Anatomy, plan: StudyPlan, folder: AnyFolder, console: Console
+    setups: Sequence[ArmSetup],
+    anatomy: Anatomy,
+    folder: AnyFolder,
+    console: Console,
+    *,
+    points: int,
+    seed: int,
+    command: str,
 ) -> list[str]:
-    """Evaluate the setups, rank them if there are several, and write report, points, heat maps, pictures and summary.
+    """Evaluate the setups, rank them if there are several, and write report, points, heat maps and picture.
 
     Args:
         setups: the one that is reported first, then those it is compared with.
         anatomy: of the organ.
-        plan: how it is run.
         folder: for the files.
         console: for progress and results.
+        points: number of points of the organ to be tried.
+        seed: of the points.
+        command: the command line, for the report.
 
     Returns:
         The names of the files.
     """
-    found = [evaluate(setup, anatomy, plan, console, pictures=number == 0) for number, setup in enumerate(setups)]
-    first = found[0]
-    ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
-    episodes = scripted_episodes(setups[0], plan, console) if plan.episodes else None
-    said = _said(first, episodes)
-    more = {"verdict": said, "command": plan.command, "compared": [vars(one) for one in ranking]}
-    summary = {**first.summary, **plain_json({**more, **plain_episodes(episodes)}, digits=12)}
-    (folder / SUMMARY_NAME).write_text(
-        json.dumps(summary, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
-    write_points(first, folder / POINTS_NAME)
+    found = []
     with StepProgress(console) as progress:
+        for setup in setups:
+            progress.say(f"{setup.name}: {setup.what}")
+            found.append(
+                evaluate_arms(
+                    anatomy,
+                    setup.left,
+                    setup.right,
+                    setup.ports,
+                    seed=seed,
+                    count=points,
+                    progress=progress,
+                    picture=setup is setups[0],
+                )
+            )
+        first = found[0]
         maps = ArmMaps(first).write_all(folder, progress)
-    shown = "Each tip is at a point that its arm reaches; an arm that reaches none stands at home."
-    pictures = write_images(first.pictures, folder, name="arms", description=shown)
-    shown = "The lobe and both arms in the overview and through the endoscope; "
-    shown += "the target is green, arrows are the tissue's force on each tool."
-    drawn = {} if episodes is None else episodes.pictures
-    ends = write_images(drawn, folder, name="episode", description=shown)
-    curves = draw_cycle(first, folder)
-    write_report(
-        first,
-        folder / REPORT_NAME,
-        pictures=pictures,
-        maps=maps,
-        command=plan.command,
-        ranking=ranking,
-        episodes=episodes,
-        episode_pictures=ends,
-        cycle=cycle_section(first, curves),
-    )
-    console.print(said, highlight=False)
-    for one in ranking:
-        figures = (
-            f"both {100.0 * one.both:.0f} %, median clearance {number_text(one.clearance, 1e3, 1, 'mm')}, "
-            f"smallest tip force {number_text(one.force, 1.0, 2, 'N')}"
-        )
-        console.print(f"{one.place}. {one.name}: {figures}", highlight=False)
-    return [REPORT_NAME, POINTS_NAME, SUMMARY_NAME, *(one.name for one in (*pictures, *maps, *ends, *curves))]
-
-
-def _said(evaluation: ArmsEvaluation, episodes: Episodes | None) -> str:
-    """The first paragraph of a report."""
-    parts = verdict(evaluation), cycle_clause(evaluation), clause(episodes)
-    return " ".join(filter(None, parts))
-
-
-def evaluate(setup: ArmSetup, anatomy: Anatomy, plan: StudyPlan, console: Console, *, pictures: bool) -> ArmsEvaluation:
-    """One setup on the organ, with a progress bar."""
-    left, right = setup.left.description, setup.right.description
-    with _progress(setup.name, console) as tell:
-        return evaluate_arms(
-            anatomy,
-            left,
-            right,
-            setup.ports,
-            seed=plan.seed,
-            count=plan.points,
-            progress=lambda what, share: tell(f"{setup.name}: {what}", share),
-            pictures=pictures,
-        )
-
-
-def scripted_episodes(setup: ArmSetup, plan: StudyPlan, console: Console) -> Episodes:
-    """Episodes of the oracle script with a setup's arms, with a progress bar."""
-    seeds = range(plan.seed, plan.seed + plan.episodes)
-    with _progress("episodes", console) as tell:
-        return run_episodes(plan.instruments, (setup.left, setup.right), seeds, tell)
-
-
-@contextmanager
-def _progress(name: str, console: Console) -> Iterator[Tell]:
-    """A progress bar, and what tells it the current work and its share."""
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda what, share: bar.update(task, description=what, completed=share)
+    ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
+    write_points(first, folder / POINTS_NAME)
+    pictures = [] if first.picture is None else [write_picture(first.picture, folder / PICTURE_NAME)]
+    write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
+    console.print(verdict(first), highlight=False)
+    return [REPORT_NAME, POINTS_NAME, *(one.name for one in (*pictures, *maps))]
 
 
 def write_report(
@@ -440,9 +273,6 @@ def write_report(
     maps: Sequence[Picture],
     command: str,
     ranking: Sequence[Ranked] = (),
-    episodes: Episodes | None = None,
-    episode_pictures: Sequence[Picture] = (),
-    cycle: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report.
 
@@ -453,14 +283,11 @@ def write_report(
         maps: heat maps.
         command: the command that makes this report.
         ranking: of several placements or robots; left out if there is none.
-        episodes: run by a script; left out if there are none.
-        episode_pictures: the ends of episodes.
-        cycle: the result of `cycle_section`; left out for a patient who holds still.
     """
     page = render_page(
         "arms.html.j2",
         title=f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)",
-        verdict=_said(evaluation, episodes),
+        verdict=verdict(evaluation),
         ranking=ranking,
         ranking_rule=RANKING_RULE,
         number_text=number_text,
@@ -471,9 +298,7 @@ def write_report(
         values=_values(evaluation),
         distances=[(title, *spread(getattr(evaluation, field)).texts(1e3, 1)) for field, title, _ in DISTANCES],
         reasons=_reasons(evaluation),
-        touches=_touches(evaluation),
-        episodes=episodes and _episodes(episodes, evaluation.scene, episode_pictures),
-        cycle=cycle,
+        cycle=cycle_section(evaluation),
         definitions=_definitions(),
         command=command,
     )
@@ -508,41 +333,6 @@ def _reasons(evaluation: ArmsEvaluation) -> Rows:
         masks = [arm.reason == index for _, arm in sides(evaluation)]
         rows.append((reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
     return rows
-
-
-def _touches(evaluation: ArmsEvaluation) -> Rows:
-    """Parts that touch, what they touch, and the number of points for the left and the right arm."""
-    found: dict[tuple[int, str], list[int]] = {}
-    for number, (_, arm) in enumerate(sides(evaluation)):
-        for touch in arm.touches:
-            found.setdefault((touch.reason, touch.part), [0, 0])[number] = touch.points
-    ranked = sorted(found.items(), key=lambda item: (item[0][0], -sum(item[1])))
-    return [(part, REASONS[reason], *map(str, counts)) for (reason, part), counts in ranked]
-
-
-def _episodes(episodes: Episodes, organ: str, pictures: Sequence[Picture]) -> dict[str, Any]:
-    """What was run; a row for each episode (seed, success, measures, reason) and one of medians; the definitions."""
-    rows = [
-        (
-            str(one.seed),
-            "yes" if one.success else "no",
-            [measure.text(getattr(one, measure.field)) for measure in MEASURES],
-            one.reason,
-        )
-        for one in episodes.runs
-    ]
-    succeeded = sum(one.success for one in episodes.runs)
-    if rows:
-        medians = [measure.text(median_of(episodes.runs, measure)) for measure in MEASURES]
-        rows.append(("medians", f"{succeeded} of {len(episodes.runs)}", medians, ""))
-    return {
-        "paragraphs": what_was_run(episodes, organ),
-        "measures": MEASURES,
-        "rows": rows,
-        "failed": succeeded < len(episodes.runs),
-        "pictures": pictures,
-        "definitions": [(measure.title, measure.definition) for measure in MEASURES],
-    }
 
 
 def _definitions() -> list[tuple[str, str]]:

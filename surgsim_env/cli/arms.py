@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from surgsim_env.arm_study.ports import Ports, default_ports, read_ports
-from surgsim_env.arm_study.study import RESULT_NAMES, ArmSetup, StudyPlan, run_study
+from surgsim_env.arm_study.study import RESULT_NAMES, ArmSetup, run_study
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
@@ -24,7 +24,7 @@ PORT_TABLES = {"left", "right", "endoscope"}
 class Arms:
     """Evaluate two arms on a patient's organ: reach of each and of both at once, clearances, forces, dexterity.
 
-    Writes report.html (self-contained), points.csv, heat maps (PNG) and summary.json. See docs/arms_report.md.
+    Writes report.html (self-contained), points.csv, heat maps and a picture (PNG). See docs/arms_report.md.
     """
 
     left: str
@@ -40,13 +40,11 @@ class Arms:
     """Other ports files, or arms for both sides, to be ranked in one table with reasons."""
     points: int = 500
     """Number of points of the organ to be tried."""
-    episodes: int = 3
-    """Number of scripted episodes in which the arms lift a lobe and touch the target under it; 0: none."""
     seed: int = 0
-    """Seed of the points and of the starts of the searches for joints."""
+    """Seed of the points."""
     motion: str | None = None
-    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, clearance and following
-    through the cycle to the report (cycle.png)."""
+    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, paths and clearance
+    through the cycle to the report."""
     out: Path = Path("runs/arms")
     """Folder for the results."""
 
@@ -59,25 +57,26 @@ class Arms:
             words += ["--ports", _shown(self.ports)]
         if self.compare:
             words += ["--compare", *map(_shown, self.compare)]
-        counts = ["--points", self.points, "--episodes", self.episodes, "--seed", self.seed]
+        counts = ["--points", self.points, "--seed", self.seed]
         if self.motion is not None:
             counts += ["--motion", self.motion]
         return shlex.join([*words, *map(str, counts)])
 
     def run(self, console: Console) -> int:
-        """Evaluate and write report.html, points.csv, the heat maps and summary.json.
+        """Evaluate and write report.html, points.csv, the heat maps and a picture of the arms.
 
         Raises:
             ValueError: one line about an option that is not possible.
         """
-        for name, least in (("points", FEWEST_POINTS), ("episodes", 0), ("seed", 0)):
+        for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
         anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
-        plan = StudyPlan(self.points, self.seed, self.episodes, (self.left, self.right), self.command_line)
         with output_folder(self.out, RESULT_NAMES) as files:
-            written = run_study(setups, anatomy, plan, files, console)
+            written = run_study(
+                setups, anatomy, files, console, points=self.points, seed=self.seed, command=self.command_line
+            )
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0
 
@@ -95,8 +94,10 @@ def _setup(command: Arms, anatomy: Anatomy, compared: str | None) -> ArmSetup:
         name, what = Path(compared).name, f"arm on both sides, at the ports of {given}"
         left = right = _read("--compare", compared)
     placed, radius = _checked_ports(ports, anatomy), anatomy.scene.instrument.tip_radius
-    left_arm = load_arm(left, placed.left.port, tip_radius=radius)
-    return ArmSetup(name, what, left_arm, load_arm(right, placed.right.port, tip_radius=radius), placed)
+    # A model that is wrong is refused before the first evaluation, which takes a minute.
+    for description, place in ((left, placed.left), (right, placed.right)):
+        load_arm(description, place.port, tip_radius=radius)
+    return ArmSetup(name, what, left, right, placed)
 
 
 def _is_ports_file(source: str) -> bool:

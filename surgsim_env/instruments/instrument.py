@@ -208,11 +208,6 @@ class Instrument(ToolBodies):
         return bool(self.servo.limited[: len(self.servo.limited) - 2 * len(self.jaws)].any())
 
     @property
-    def opening(self) -> float | None:
-        """Gap between the pads of the jaw [m]; None without one."""
-        return None if self.jaw is None else self.jaw.opening
-
-    @property
     def trocar_residual(self) -> float | None:
         """Distance of the shaft's axis from the trocar [m]; None for an instrument that passes through none."""
         return None

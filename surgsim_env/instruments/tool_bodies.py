@@ -146,10 +146,6 @@ class ToolBodies:
         tool_kernels.read_jacobian(self.views(), tool)
         return self._jacobians[tool]
 
-    def apply_wrench(self, wrench: FloatArray) -> None:
-        """Apply the tissue's mean wrench to each tool, shape (n_tool, 6) [N, N m], in place of the last one."""
-        self.data.xfrc_applied[self._tools] = wrench
-
     def views(self, *, compiled: bool = False) -> ToolViews:
         """What stepping these tools reads and writes, for compiled code or for Python; valid until `data` is replaced.
 

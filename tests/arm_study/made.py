@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from surgsim_env.arm_study.episodes import ArmsEpisode, Episodes, StandIn
 from surgsim_env.arm_study.results import ArmReach, ArmsEvaluation, ArmThroughCycle, ThroughCycle
 from surgsim_env.palpation.surface_drawing import tube
 from surgsim_env.scene.model import Port
@@ -16,23 +15,6 @@ PORTS = {
     "endoscope": Port((0.0, -0.12, 0.11), (0.0, 0.74, -0.67)),
 }
 PICTURE = np.arange(40 * 60 * 3, dtype=np.int64).reshape(40, 60, 3).astype(np.uint8)
-
-
-def made_episodes(*, failing=False):
-    """Two made-up episodes with a stand-in on the left; failing: the second one failed, a third never began."""
-    first = ArmsEpisode(3, True, 11.2, 0.37, 0.26, 0.46, 0.56, 0.0112, 0.0, 0.0)
-    runs = (first, ArmsEpisode(4, True, 12.4, 0.41, 0.20, 0.52, 0.60, 0.05, 0.1, 2.0))
-    if failing:
-        why = "step 4 of 9, 'lift', tore the tissue (1.203 N); tip at (40.00, 45.00, 20.00) mm, contact force 1.3 N"
-        runs = (
-            first,
-            ArmsEpisode(4, False, 5.0, 0.41, 0.20, 1.20, 0.0, 0.05, 0.1, 2.0, failure=why),
-            ArmsEpisode(5, False, failure="it could not begin: <no way>"),
-        )
-    ports = (Port((-0.01, 0.2, 0.06), (0.2, -0.9, -0.35)), Port((0.09, 0.2, 0.06), (-0.2, -0.9, -0.35)))
-    stand_ins = (StandIn("left", "psm_retractor", "psm_grasper", "jaw with flat pads to hold tissue with"),)
-    pictures = {"How the episode of seed 3 ended": PICTURE}
-    return Episodes("lobe", "psm_retractor", "psm_palpator", ports, stand_ins, runs=runs, pictures=pictures)
 
 
 def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0, 9.0), clearance=(0.004, 0.05)):
@@ -63,7 +45,7 @@ def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0,
 
 
 def made_evaluation(
-    *, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), pictures=True, **reach
+    *, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), picture=True, **reach
 ):
     """Two arms, the left one reaching what lies at x > -left_to of the half axis, the right one at x < right_to."""
     generator = np.random.default_rng(seed)
@@ -95,52 +77,34 @@ def made_evaluation(
         both=both,
         arm_distance_inside=inside,
         arm_distance_outside=outside,
-        summary={
-            "seed": seed,
-            "inputs": {"scene": "ellipsoid", "left": "psm_grasper", "right": "psm_palpator", "points": count},
-            "versions": {"surgsim": "0.1.0", "numpy": np.__version__},
-        },
         scene="ellipsoid",
         surface_points=sphere * HALF_AXES,
         surface_triangles=triangles,
-        pictures={"both arms at one point, from the camera": PICTURE} if pictures else {},
         ports=PORTS,
+        picture=PICTURE if picture else None,
     )
 
 
-def made_follower(generator, reachable, *, quickest=0.5):
+def made_follower(generator, reachable):
     """An arm at three positions: it loses a tenth of its points at the top, and has a path for the others."""
     count = len(reachable)
     each = np.stack([reachable, reachable, reachable & (generator.random(count) > 0.1)])
     path = np.asarray(each.all(axis=0))
-    names, limit = ("yaw", "pitch", "insertion"), np.array([2.0, 1.0, 0.4])
-    speed = np.where(path[:, None], generator.uniform(0.1, quickest, (count, 3)) * limit, np.nan)
     return ArmThroughCycle(
         reachable=each,
         joints=np.where(path[:, None], generator.uniform(-1.0, 1.0, (3, count, 3)), np.nan),
         clearance=np.where(path, generator.uniform(0.001, 0.01, (3, count)), np.nan),
-        speed=speed,
-        speed_share=quickest * np.sin(np.linspace(0.0, math.pi, 11)),
-        joint_names=names,
-        hinge=np.array([True, True, False]),
-        speed_limit=limit,
     )
 
 
-def made_cycle(evaluation, *, seed=0, quickest=0.5):
+def made_cycle(evaluation, *, seed=0):
     """A breath at rest, half way and at the top, for the points of an evaluation."""
     generator = np.random.default_rng(seed)
-    left, right = (
-        made_follower(generator, arm.reachable, quickest=quickest) for arm in (evaluation.left, evaluation.right)
-    )
-    time = np.linspace(0.0, 4.0, 11)
+    left, right = (made_follower(generator, arm.reachable) for arm in (evaluation.left, evaluation.right))
     return ThroughCycle(
         motions=("breathing",),
         travel=np.array([0.0096]),
         period=np.array([4.0]),
-        level=np.array([[0.0], [0.5], [1.0]]),
-        time=time,
-        course=np.sin(0.25 * math.pi * time) ** 2,
         left=left,
         right=right,
         both=evaluation.both & left.reachable & right.reachable,

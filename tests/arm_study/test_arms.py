@@ -1,6 +1,5 @@
 """The whole evaluation: mirrored scenes, repeated runs, and every mistake in one line."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from surgsim_env.arm_study.ports import (
     ports_from_table,
     read_ports,
 )
-from surgsim_env.arm_study.results import ArmReach
+from surgsim_env.arm_study.results import REASONS, ArmReach
 from surgsim_env.arm_study.study import evaluate_arms, facing_points
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.patient.fine_surface import split_edges
@@ -42,7 +41,6 @@ roll = 0.5
 point = [0.03, 0.03, 0.18]
 target = [0.03, 0.03, 0.03]
 [[targets]]
-name = "deep"
 point = [0.03, 0.03, 0.015]
 [wall]
 thickness = 0.025
@@ -60,13 +58,13 @@ def found(phantom):
 
 
 def evaluate_both_arms(phantom):
-    targets = (InnerTarget((0.03, 0.03, 0.015), "deep"), InnerTarget((0.03, 0.03, -2.0), "far"))
+    targets = (InnerTarget((0.03, 0.03, 0.015)), InnerTarget((0.03, 0.03, -2.0)))
     ports = replace(default_ports(phantom), targets=targets)
     return evaluate_arms(phantom, "psm_palpator", "psm_grasper", ports, count=25)
 
 
 def arm_figures(arm: ArmReach):
-    return {name: getattr(arm, name) for name in vars(arm) if name not in ("name", "joints", "touches")}
+    return {name: getattr(arm, name) for name in vars(arm) if name not in ("name", "joints")}
 
 
 def test_shapes_and_targets(found, phantom):
@@ -76,10 +74,8 @@ def test_shapes_and_targets(found, phantom):
         for name, values in arm_figures(arm).items():
             assert values.shape == (27,), name
         assert arm.joints.shape == (27, 6)
-    assert [(one["name"], one["left"], one["both"]) for one in found.summary["targets"]] == [
-        ("deep", "reachable", True),
-        ("far", "a joint limit", False),
-    ]
+    assert [REASONS[index] for index in found.left.reason[25:]] == ["reachable", "a joint limit"]
+    assert found.both[25:].tolist() == [True, False]
     assert found.scene == "phantom" and found.surface_points is phantom.mesh.points
 
 
@@ -124,29 +120,15 @@ def test_mujoco_agrees_with_what_is_reported(found, phantom):
 
 @pytest.mark.slow
 def test_run_repeats_to_the_byte(found, phantom):
-    """Same arguments, same bytes, of every array and of the summary; another seed, other points."""
+    """Same arguments, same bytes, of every array; another seed, other points."""
     again = evaluate_both_arms(phantom)
     for arm, other in ((found.left, again.left), (found.right, again.right)):
         for name in vars(arm):
             if name != "name":
                 assert getattr(arm, name).tobytes() == getattr(other, name).tobytes(), name
     assert found.arm_distance_inside.tobytes() == again.arm_distance_inside.tobytes()
-    assert json.dumps(found.summary) == json.dumps(again.summary)
     first = facing_points(phantom, np.array([[0.03, 0.03, 0.2]]), 5, 0)[0]
     assert not np.array_equal(first, facing_points(phantom, np.array([[0.03, 0.03, 0.2]]), 5, 1)[0])
-
-
-def test_summary_tells_versions_seed_and_inputs(found):
-    summary = json.loads(json.dumps(found.summary, allow_nan=False))
-    inputs = summary["inputs"]
-    assert inputs["seed"] == 0 and summary["points"] == inputs["count"] == 25
-    assert {"surgsim", "python", "numpy", "scipy", "mujoco"} == set(summary["versions"])
-    least = min(np.nanmin(arm.tip_force) for arm in (found.left, found.right))
-    assert summary["smallest_tip_force"]["value_N"] == pytest.approx(least)
-    assert (inputs["scene"], inputs["left"], inputs["right"]) == ("phantom", "psm_palpator", "psm_grasper")
-    assert inputs["ports"]["wall"]["thickness"] == 0.02
-    assert sum(summary["left"]["reasons"].values()) == 25
-    assert summary["reachable"]["both"] == pytest.approx(found.both[:25].mean())
 
 
 def mirrored_description():
@@ -188,7 +170,6 @@ def test_mirrored_scene_has_the_mirrored_report():
             assert getattr(theirs, name) == pytest.approx(values, rel=1e-4, abs=2e-6, nan_ok=True), name
     assert one.both.tolist() == other.both.tolist()
     assert other.arm_distance_inside == pytest.approx(one.arm_distance_inside, abs=2e-6, nan_ok=True)
-    assert one.summary["reachable"]["left"] == other.summary["reachable"]["right"]
 
 
 def test_default_ports_follow_the_rules(phantom):
@@ -206,9 +187,9 @@ def test_ports_file(tmp_path):
     path = tmp_path / "near.toml"
     path.write_text(PORTS_FILE)
     ports = read_ports(path)
-    assert ports.name == "near" and ports.wall.thickness == 0.025
+    assert ports.wall.thickness == 0.025
     assert ports.left.port.into == pytest.approx((0.08, 0.0, -0.15))
-    assert ports.right.roll == 0.5 and ports.targets[0].name == "deep"
+    assert ports.right.roll == 0.5 and ports.targets[0].point == (0.03, 0.03, 0.015)
 
 
 def table(**changes):
@@ -235,8 +216,6 @@ NO_PORT = {"point": [0.0, 0.0, 0.1]}
         ({"wall": {"thickness": -0.01}}, "thickness"),
         ({"wall": {"hole": 0.001}}, "hole"),
         ({"wall": {"radius": 0.05}}, "raise wall.radius"),
-        ({"wall": {"normal": [0.0, 0.0, 0.0]}}, "wall.normal"),
-        ({"targets": [{"point": [0.0, float("nan"), 0.0]}]}, "finite"),
         ({"endoscope": {"point": [0.0, 0.0, 0.1], "target": [0.0, 0.0, 0.1]}}, "another, finite point"),
     ],
 )
@@ -257,11 +236,11 @@ def test_port_inside_the_organ_is_refused(phantom, side):
     ("changes", "words"),
     [
         ({"sites": ""}, "tip site 'tip' is not in the model"),
-        ({"sites": SITE + SITE}, "two parts <site> are named 'tip'"),
+        ({"sites": SITE + SITE}, "repeated name 'tip' in site"),
         ({"table": TABLE.replace("slide = 0.1", "slide = 0.3")}, "outside its limits"),
         ({"table": TABLE.replace("slide = 0.1", "")}, "home gives no value for joint 'slide'"),
         ({"table": TABLE.replace('"palpator"', '"grasper"')}, "a grasper needs a jaw"),
-        ({"model": "limits"}, "the limits of joint 'slide' cross"),
+        ({"model": "limits"}, "joint 'slide' has no limits, or limits that cross"),
     ],
 )
 def test_bad_arms_are_refused(tmp_path, phantom, changes, words):
@@ -281,7 +260,6 @@ def test_bad_arms_are_refused(tmp_path, phantom, changes, words):
         ({"scene": "phantm"}, "did you mean 'phantom'"),
         ({"left": "psm_graspr"}, "psm_grasper"),
         ({"ports": "nowhere.toml"}, "cannot be read"),
-        ({"count": 0}, "at least 1 is needed"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, words):
@@ -314,8 +292,8 @@ def test_ports_too_far_off_reach_nothing(phantom, found):
         right={"point": [0.11, 0.03, 0.33], "target": [0.03, 0.03, 0.03]},
     )
     far = evaluate_arms(phantom, "psm_palpator", "psm_grasper", ports_from_table(up, name="far"), count=5)
-    assert far.summary["reachable"]["either"] == 0.0
-    assert found.summary["reachable"]["either"] > 0.5
+    assert not (far.left.reachable | far.right.reachable).any()
+    assert found.both.mean() > 0.5
 
 
 def test_pictures_show_the_fine_surface(phantom, tmp_path):
@@ -330,19 +308,9 @@ def test_pictures_show_the_fine_surface(phantom, tmp_path):
     np.testing.assert_array_equal(one.points, other.points)
 
 
-def test_progress_is_told(phantom):
-    told = []
-    evaluate_arms(
-        phantom, "psm_grasper", "psm_grasper", count=2, progress=lambda what, share: told.append((what, share))
-    )
-    shares = [share for _, share in told]
-    assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0
-    assert told[1][0].startswith("the left arm")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["phantom", "liver"])
 def test_five_hundred_points(scene):
     """Two da Vinci-like arms at their default ports reach most of what faces them."""
     found = evaluate_arms(scene, "psm_palpator", "psm_palpator", count=500)
-    assert found.summary["reachable"]["both"] > 0.9
+    assert found.both.mean() > 0.9

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.arm_study.pictures import ArmMaps, write_images
+from surgsim_env.arm_study.pictures import ArmMaps, write_picture
 from surgsim_env.arm_study.results import rank
 from surgsim_env.arm_study.study import write_report
 from surgsim_env.reports.html_page import POLICY
-from tests.arm_study.made import made_episodes, made_evaluation
+from tests.arm_study.made import made_evaluation
 from tests.chromium import Browser
 
 # Measured in the page: the widths of its pictures, its width and that of the window, the addresses it has fetched.
@@ -43,16 +43,13 @@ def report(tmp_path_factory) -> Path:
     evaluation = made_evaluation()
     others = [("ports.toml", "as given", evaluation), ("wide.toml", "ports", made_evaluation(seed=1))]
     path = folder / "report.html"
-    episodes = made_episodes(failing=True)
     write_report(
         evaluation,
         path,
-        pictures=write_images(evaluation.pictures, folder, name="arms", description="the arms"),
+        pictures=[write_picture(evaluation.picture, folder / "arms.png")],
         maps=ArmMaps(evaluation).write_all(folder),
         command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
         ranking=rank(others),
-        episodes=episodes,
-        episode_pictures=write_images(episodes.pictures, folder, name="episode", description="the ends"),
     )
     return path
 
@@ -84,7 +81,7 @@ def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, s
     browser = shown(report, width)
     made = browser.run(MADE)
     assert browser.complaints() == []
-    assert len(made["images"]) == text.count("<img") == 13
+    assert len(made["images"]) == text.count("<img") == 11
     assert min(made["images"]) >= 60
     assert made["widest"] <= made["window"] == width
     assert made["loaded"] == 0

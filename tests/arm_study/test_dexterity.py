@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.arm_study import reach
-from surgsim_env.arm_study.joint_search import DIRECTION_COUNT, approach_directions, approach_share
+from surgsim_env.arm_study.joint_search import DIRECTION_COUNT, approach_directions, directions_met
 from surgsim_env.arm_study.kinematics import BatchKinematics
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.scene.model import Port
@@ -113,12 +113,13 @@ def test_approach_share_counts_usable_tips():
     directions = approach_directions(
         np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]), np.array([1.0, 0.0, 0.0])
     )
+    every, one = np.ones((1, 5), dtype=bool), np.ones((1, 1), dtype=bool)
     pointing = -directions[:, :5]
-    assert approach_share(pointing, np.ones((1, 5), dtype=bool), directions)[0] == 5 / 32
-    assert approach_share(pointing, np.zeros((1, 5), dtype=bool), directions)[0] == 0.0
+    assert directions_met(pointing, every, directions).sum() == 5
+    assert not directions_met(pointing, ~every, directions).any()
     turned = -directions[:, :1] + [[[0.0, math.tan(math.radians(9.9)), 0.0]]]
     turned /= np.linalg.norm(turned, axis=2)[..., None]
-    assert approach_share(turned, np.ones((1, 1), dtype=bool), directions)[0] == 1 / 32
+    assert directions_met(turned, one, directions).sum() == 1
     turned = -directions[:, :1] + [[[0.0, math.tan(math.radians(10.1)), 0.0]]]
     turned /= np.linalg.norm(turned, axis=2)[..., None]
-    assert approach_share(turned, np.ones((1, 1), dtype=bool), directions)[0] == 0.0
+    assert not directions_met(turned, one, directions).any()

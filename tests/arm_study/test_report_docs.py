@@ -11,7 +11,7 @@ from surgsim_env.arm_study.ports import default_ports, ports_from_table
 from surgsim_env.cli.main import main
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
-from tests.arm_study.made import made_episodes, made_evaluation
+from tests.arm_study.made import made_evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = (ROOT / "docs" / "arms_report.md").read_text(encoding="utf-8")
@@ -38,10 +38,9 @@ def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     for name in ("ports.toml", "wide.toml"):
         Path(name).write_text(text)
-    monkeypatch.setattr(study, "evaluate", lambda *_, **__: made_evaluation())
-    monkeypatch.setattr(study, "scripted_episodes", lambda *_: made_episodes())
+    monkeypatch.setattr(study, "evaluate_arms", lambda *_, **__: made_evaluation())
     assert main(command.split()) == 0
     listed = re.findall(r"^\| `([\w.*]+)` \|", DOCS, flags=re.M)
-    assert len(listed) == 6
+    assert len(listed) == 4
     for pattern in listed:
         assert list(Path("runs/arms").glob(pattern)), pattern

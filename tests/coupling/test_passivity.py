@@ -81,13 +81,13 @@ def two_fingers() -> ToolBodies:
 def test_tools_yield_as_mujoco_will(tool):
     """Change of the twist in mj_step2 under a wrench: dt (a + B w), to rounding; what was applied before is gone."""
     body = tool()
-    body.apply_wrench(np.full((body.tool_count, 6), 3.0))
+    body.data.xfrc_applied[body.views().bodies] = 3.0
     mujoco.mj_step1(body.model, body.data)
     body.read_shapes()
     before = body.shapes.tool_twist.copy()
     body.read_response()
     wrench = np.array([[0.3, -0.2, 0.5, 1e-3, 2e-3, -1e-3], [0.1, 0.4, 0.2, 2e-3, -1e-3, 1e-3]])[: body.tool_count]
-    body.apply_wrench(wrench)
+    body.data.xfrc_applied[body.views().bodies] = wrench
     jacobians = np.array([body.jacobian(index) for index in range(body.tool_count)])
     mujoco.mj_step2(body.model, body.data)
     after = jacobians @ body.data.qvel

@@ -21,7 +21,7 @@ def test_the_observation_is_what_its_table_says(retract_env):
     np.testing.assert_allclose(observation[3:6], [0.004, 0.0, 0.002], atol=5e-4)
     axes = observation[6:12].reshape(2, 3)
     np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-6)
-    assert observation[12] == pytest.approx(retract_env.simulation.instrument.opening, abs=1e-6)
+    assert observation[12] == pytest.approx(retract_env.simulation.instrument.jaw.opening, abs=1e-6)
     bias = retract_env.task.sensors["contact_force"].bias
     np.testing.assert_allclose(observation[13:16], bias, atol=6 * retract_env.scene.sensor.noise)
     np.testing.assert_array_equal(observation[13:16], retract_env.task.sensed_force(observation).astype(np.float32))

@@ -247,15 +247,15 @@ def test_button_closes_the_jaw():
     device = Puppet(simulation.instrument.parked)
     loop = HapticLoop(simulation, device)
     loop.step()
-    open_gap = simulation.instrument.opening
+    open_gap = simulation.instrument.jaw.opening
     device.buttons = 1
     for _ in range(300):
         assert not loop.step().fault
-    assert simulation.instrument.opening < open_gap - 5e-3
+    assert simulation.instrument.jaw.opening < open_gap - 5e-3
     device.buttons = 0
     for _ in range(300):
         loop.step()
-    assert simulation.instrument.opening == pytest.approx(open_gap, abs=1e-3)
+    assert simulation.instrument.jaw.opening == pytest.approx(open_gap, abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -82,26 +82,3 @@ def psm_frames(joints: ArrayLike) -> FloatArray:
         pose = matmul(pose, link.transform(value))
         frames.append(pose)
     return np.array(frames)
-
-
-def psm_tip(joints: ArrayLike, tip_length: float) -> FloatArray:
-    """Pose of a tip tip_length [m] beyond the wrist's yaw axis in the port's frame, (4, 4); its z points outwards."""
-    tip = np.eye(4)
-    tip[:3, :3] = TIP_ROTATION
-    tip[:3, 3] = tip_length * TIP_ROTATION[:, 2]
-    return matmul(psm_frames(joints)[-1], tip)
-
-
-def shaft_depth(insertion: float) -> float:
-    """How far the wrist's pitch axis is past the remote centre at an insertion [m], in metres: l = q3 - 0.0156."""
-    return insertion + PSM_LINKS[2].d + PSM_LINKS[3].d
-
-
-def psm_manipulability(joints: ArrayLike) -> float:
-    """Yoshikawa's sqrt(det J J^T) of yaw, pitch and insertion at the wrist's pitch axis [m^2]: l^2 cos(q2).
-
-    Yaw and pitch are the angles of spherical coordinates about the remote centre, l the radius: the columns of J are
-    perpendicular and have the lengths l cos(q2), l and 1. (T. Yoshikawa, Manipulability of robotic mechanisms, 1985.)
-    """
-    values = np.asarray(joints, dtype=np.float64)
-    return np.square(shaft_depth(float(values[2]))) * float(cos(values[1]))

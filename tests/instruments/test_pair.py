@@ -43,8 +43,8 @@ def test_each_arm_stands_as_it_would_alone():
         direction = arm.tip_rotation @ arm.arm.description.tip.direction
         np.testing.assert_allclose(direction, [0.0, -1.0, 0.0], atol=1e-6)
         assert arm.trocar_residual < 1e-9
-    assert pair.opening == pair.arms["left"].opening > 0.018
-    assert pair.arms["right"].opening is None and pair.arms["right"].jaw is None
+    assert pair.jaw.opening == pair.arms["left"].jaw.opening > 0.018
+    assert pair.arms["right"].jaw is None
     # The gear of the jaw and its serrated pads stay so beside another arm.
     assert pair.model.ntendon == 1
     assert pair.jaw is pair.arms["left"].jaw
@@ -62,7 +62,7 @@ def test_each_tip_follows_its_own_line():
     assert not one.instrument.workspace_limited
     one.instrument.arms["left"].command_jaw(-1.0)
     run(one, 12)
-    assert one.instrument.opening == pytest.approx(0.0055, abs=2e-4)
+    assert one.instrument.jaw.opening == pytest.approx(0.0055, abs=2e-4)
     with pytest.raises(ValueError, match=r"psm_palpator.* has no jaw: it carries a palpator"):
         one.instrument.arms["right"].command_jaw(0.0)
 

@@ -1,6 +1,5 @@
 """Kinematics of an arm: tip, shaft, shapes and Jacobians at given joint values."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.arithmetic import dot, eigh, matmul, norm
+from msdm_core.arithmetic import dot, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm
@@ -37,7 +36,6 @@ class Arm:
         lower, upper: limits [rad or m]                                          (n,)
         speed_limit: [rad/s or m/s]                                              (n,)
         home: [rad or m]                                                         (n,)
-        jaw_range: smallest and largest opening of the jaw [rad], (0, 0) without one
         shape_names, shape_radius: outer shapes (felt ones first) and radii [m]; a box counts as the capsule of the
             same length around its cross-section                                 (n_shape,)
         shape_half_axis: from the middle of each shape to its end, in its geom's frame [m]  (n_shape, 3)
@@ -57,8 +55,6 @@ class Arm:
         self.lower, self.upper = model.jnt_range[index, 0].copy(), model.jnt_range[index, 1].copy()
         self.speed_limit = np.array(description.control.speed_limit)
         self.home = np.array([description.home[name] for name in self.joints])
-        jaw = [model.joint(name).range for name in description.jaw]
-        self.jaw_range = (math.fsum(low for low, _ in jaw), math.fsum(high for _, high in jaw))
         groups = [np.flatnonzero(model.geom_group == group) for group in (CONTACT_GROUP, LINK_GROUP)]
         self.shapes = np.concatenate(groups)
         self.felt = np.arange(len(self.shapes)) < len(groups[0])
@@ -130,11 +126,6 @@ class Arm:
         centre = data.geom_xpos[self.shapes]
         return np.stack([centre - axis, centre + axis], axis=1)
 
-    def manipulability(self, joints: ArrayLike) -> float:
-        """Yoshikawa's sqrt(det J J^T) of the tip's velocity over all joints; units follow from those of the joints."""
-        linear = self.tip_jacobian(joints)[:3]
-        return float(np.sqrt(np.prod(np.maximum(eigh(matmul(linear, linear.T))[0], 0.0))))
-
     def write(self, data: mujoco.MjData, joints: ArrayLike, jaw: float = 0.0) -> None:
         """Write joint values (n,) and a jaw angle [rad], shared by its fingers, into MuJoCo's coordinates."""
         data.qpos[self.qpos] = joints
@@ -142,10 +133,7 @@ class Arm:
             data.qpos[self.model.joint(name).qposadr[0]] = jaw / len(self.description.jaw)
 
     def _at(self, joints: ArrayLike, jaw: float = 0.0, *, moving: bool = False) -> mujoco.MjData:
-        values = np.asarray(joints, dtype=np.float64)
-        if values.shape != (self.joint_count,):
-            raise ValueError(f"joint values have shape {values.shape}; the arm has {self.joint_count} driven joints")
-        self.write(self._data, values, jaw)
+        self.write(self._data, joints, jaw)
         mujoco.mj_kinematics(self.model, self._data)
         if moving:
             mujoco.mj_comPos(self.model, self._data)

@@ -1,13 +1,12 @@
-"""One arm as the instrument of a scene, and the parts that two arms share: ports, servos, wrist sensor."""
+"""One arm as the instrument of a scene, and the parts that two arms share: ports and servos."""
 
 import math
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
-from msdm_core.arithmetic import arctan2, cos, matmul, norm, sin
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.arithmetic import cos, matmul, norm, sin
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.instruments.arm.model import position_actuator, speed_actuator
 from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
@@ -66,7 +65,6 @@ class ArmInstrument(SteeredArms):
     Fields:
         arm: its kinematics
         steered: its control
-        wrist: its force sensor, None if the model has none
     """
 
     def __init__(self, anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> None:
@@ -93,16 +91,9 @@ class ArmInstrument(SteeredArms):
             jaw=self.jaw,
         )
         self.arms = {"": self.steered}
-        self.wrist = WristSensor.of(model)
         self.parked = parked_place(anatomy)
         self._check_reach(anatomy)
         self.place(self.parked)
-
-    @property
-    def direction(self) -> FloatArray:
-        """Commanded direction of the tip, (3,)."""
-        wanted = self.steered.wanted
-        return wanted.copy() if wanted.ndim == 1 else matmul(wanted, np.asarray(self.arm.description.tip.direction))
 
     @property
     def joint_positions(self) -> FloatArray:
@@ -128,27 +119,19 @@ class ArmInstrument(SteeredArms):
         """
         self.steered.command_velocity(velocity, self.turning_of(turning))
 
-    def command_jaw(self, target: float) -> None:
-        """Command the jaw to a target from -1 (closed) to 1 (open), which it approaches at limited speed and holds.
-
-        Raises:
-            ValueError: no jaw, or a target outside that range.
-        """
-        self.steered.command_jaw(target)
-
     def _where(self) -> str:
         return self.steered.where
 
     def _check_reach(self, anatomy: Anatomy) -> None:
-        """The tip comes to the parking place and to places all over the palpable face."""
-        face = anatomy.face
+        """The tip comes to places all over the palpable face."""
+        face, retract = anatomy.face, anatomy.scene.retract
+        if retract is not None and retract.flap is not None:
+            # Only the edge of a flap is grasped.
+            return
         corners = face.points[face.triangles]
         thick = np.flatnonzero(face.thickness >= face.thickness_smallest)
         tried = thick[np.linspace(0, len(thick) - 1, min(PLACES_TRIED, len(thick))).astype(int)]
-        radius, retract = anatomy.scene.instrument.tip_radius, anatomy.scene.retract
-        places = [self.parked, *(corners[tried].mean(axis=1) - radius * face.approach)]
-        # On a flap only the edge is grasped, and the arm is parked before it.
-        for place in places[:1] if retract is not None and retract.flap is not None else places:
+        for place in corners[tried].mean(axis=1) - anatomy.scene.instrument.tip_radius * face.approach:
             found = self.steered.reach(place)
             if not placed(found):
                 raise ValueError(
@@ -164,7 +147,7 @@ def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
         ValueError: a wrong description or model, or a port inside the organ.
     """
     scene = anatomy.scene
-    check_port_outside(port, f"scene {scene.name!r}", anatomy.mesh.points, anatomy.mesh.boundary_triangles)
+    check_port_outside(port, anatomy)
     beside = scene.folder / name
     return load_arm(
         beside if beside.is_file() else name,
@@ -188,26 +171,25 @@ def default_port(face: PalpableFace) -> Port:
     return Port((x, y, z), (u, v, w))
 
 
-def inside_surface(point: ArrayLike, points: FloatArray, triangles: IntArray) -> bool:
-    """Whether a point [m] lies within a closed surface, by its solid angle (van Oosterom & Strackee 1983)."""
-    a, b, c = (points[triangles[:, corner]] - np.asarray(point, dtype=np.float64) for corner in range(3))
-    la, lb, lc = (norm(side, axis=1) for side in (a, b, c))
-    triple = (a * np.cross(b, c)).sum(axis=1)
-    rest = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    return bool(abs(2.0 * arctan2(triple, rest).sum()) > 2.0 * math.pi)
-
-
-def check_port_outside(
-    port: Port, name: str, points: FloatArray, triangles: IntArray, *, what: str = "the port"
-) -> None:
-    """Refuse a port inside an organ, whose closed surface has points (n, 3) [m] and triangles (m, 3).
+def check_port_outside(port: Port, anatomy: Anatomy, *, what: str = "the port") -> None:
+    """Refuse a port inside an organ.
 
     Raises:
         ValueError: the port is inside (names its place and the organ).
     """
-    if inside_surface(port.point, points, triangles):
-        place = millimetres(np.array(port.point))
-        raise ValueError(f"{what} at {place} lies inside the organ of {name}: move it out through the body wall")
+    corners = anatomy.mesh.points[anatomy.mesh.tets]
+    # It is in a tet whose volume stays positive whichever corner is moved to it.
+    inside = np.ones(len(corners), dtype=bool)
+    for corner in range(4):
+        moved = corners.copy()
+        moved[:, corner] = port.point
+        a, b, c = (moved[:, index] - moved[:, 0] for index in (1, 2, 3))
+        inside &= (np.cross(a, b) * c).sum(axis=1) > 0.0
+    if inside.any():
+        raise ValueError(
+            f"{what} at {millimetres(np.array(port.point))} lies inside the organ of scene {anatomy.scene.name!r}: "
+            "move it out through the body wall"
+        )
 
 
 def start_direction(scene: Scene) -> FloatArray:
@@ -234,39 +216,3 @@ def parked_place(anatomy: Anatomy) -> FloatArray:
     corners = anatomy.face.points[anatomy.face.triangles]
     middle = anatomy.face.project(corners.mean(axis=(0, 1)))[0]
     return middle - (anatomy.scene.instrument.tip_radius + PARKED_GAP) * anatomy.face.approach
-
-
-FORCE, TORQUE = "wrist_force", "wrist_torque"
-
-
-class WristSensor:
-    """Load on the parts distal to a site, from MuJoCo's sensors `wrist_force` and `wrist_torque` there.
-
-    MuJoCo gives force and torque between the site's body and its parent link, in the site's frame, including the weight
-    of the distal parts, whether or not the joints compensate for it. That weight is subtracted, as a tared sensor does:
-    at rest the load remains. In motion the reading contains the inertia of the distal parts too.
-    """
-
-    def __init__(self, model: mujoco.MjModel, site: int) -> None:
-        """Take a model with both sensors on a site."""
-        self._model, self._site = model, site
-        self._force = int(model.sensor(FORCE).adr[0])
-        self._torque = int(model.sensor(TORQUE).adr[0])
-        self._body = int(model.site_bodyid[site])
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel) -> "WristSensor | None":
-        """The sensor of a model, None without one."""
-        names = {model.sensor(index).name for index in range(model.nsensor)}
-        if not {FORCE, TORQUE} <= names:
-            return None
-        return cls(model, int(model.sensor(FORCE).objid[0]))
-
-    def read(self, data: mujoco.MjData) -> FloatArray:
-        """Load on the distal parts in the last step: force [N], torque about the site [N m], world frame, (6,)."""
-        rotation = data.site_xmat[self._site].reshape(3, 3)
-        force = matmul(rotation, data.sensordata[self._force : self._force + 3])
-        torque = matmul(rotation, data.sensordata[self._torque : self._torque + 3])
-        weight = self._model.body_subtreemass[self._body] * self._model.opt.gravity
-        arm = data.subtree_com[self._body] - data.site_xpos[self._site]
-        return np.concatenate([-force - weight, -torque - np.cross(arm, weight)])

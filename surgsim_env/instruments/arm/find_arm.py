@@ -5,8 +5,9 @@ trocar is chosen together with home, or given and a home searched whose shaft pa
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -57,10 +58,8 @@ SMALL_PART = 0.04
 ONE_MM = 1e-3
 FREE, COUPLING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtEq.mjEQ_JOINT)
 
-Tell = Callable[[str, float], None]
 
-
-@dataclass
+@dataclass(frozen=True)
 class FoundArm:
     """An arm found in a model file.
 
@@ -68,15 +67,13 @@ class FoundArm:
         description: of the arm, for a folder that contains its TOML file
         found: what was found, a sentence each
         chosen: what the file lacks and was chosen, a sentence each
-        comments: on entries of the description, by path
         reach: share of the places around home (DEPTHS, TILT) that the tip reaches
     """
 
     description: ArmDescription
-    found: list[str] = field(default_factory=list)
-    chosen: list[str] = field(default_factory=list)
-    comments: dict[str, str] = field(default_factory=dict)
-    reach: float = 0.0
+    found: list[str]
+    chosen: list[str]
+    reach: float
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,6 @@ def find_arm(
     tip: str | None = None,
     trocar: Vector | None = None,
     tool_length: float | None = None,
-    tell: Tell | None = None,
 ) -> FoundArm:
     """Make a palpating arm from an MJCF or URDF file.
 
@@ -117,23 +113,17 @@ def find_arm(
         tip: link or site of the tip, or to which a tool is mounted; by default the end of the longest chain of joints.
         trocar: point of the trocar in the model's own frame [m]; by default the remote centre, or chosen with home.
         tool_length: mount a straight palpator of this length [m], even if the model has a shaft.
-        tell: called with the current work and the share that is done.
 
     Raises:
         ValueError: a file that cannot be read, a tip that is not there, a trocar that no pose reaches.
     """
-    tell = tell or (lambda _what, _share: None)
-    tell("reading the model", 0.0)
-    survey = ModelSurvey(path)
-    return _Finder(survey, tip, trocar, tool_length, tell).found
+    return _Finder(ModelSurvey(path), tip, trocar, tool_length).found
 
 
 class _Finder:
-    def __init__(
-        self, survey: ModelSurvey, tip: str | None, trocar: Vector | None, tool_length: float | None, tell: Tell
-    ) -> None:
-        self.survey, self.model, self.tell = survey, survey.model, tell
-        self.notes, self.chosen, self.comments = [], [], {}
+    def __init__(self, survey: ModelSurvey, tip: str | None, trocar: Vector | None, tool_length: float | None) -> None:
+        self.survey, self.model = survey, survey.model
+        self.notes, self.chosen = [], []
         body, offset = survey.find_tip(tip)
         self.chain = survey.chain(body)
         self.names = [self.model.joint(joint).name for joint in self.chain]
@@ -402,8 +392,7 @@ class _Finder:
         best = None
         starts = self._good_starts(arm) if self.centre is None else self._starts_about(self.centre)
         places = [(start, place) for start in starts for place in self._trocars(arm, start)]
-        for number, (start, place) in enumerate(places):
-            self.tell("looking for a home", 0.1 + 0.8 * number / len(places))
+        for start, place in places:
             arm.trocar = place
             into = arm.shaft_line(start)[1]
             found = self._at_depth(arm, place, into, start)
@@ -416,7 +405,13 @@ class _Finder:
                 best = found, arm.trocar.copy(), into, share
             if share == 1.0:
                 break
-        return self._required(best)
+        if best is None:
+            what = "the trocar" if self.trocar_given is None else f"the trocar at {vector(self.trocar_given, 4)}"
+            raise ValueError(
+                f"model file {self.survey.path}: no pose was found with the shaft in {what} and the tip "
+                f"{1e3 * HOME_DEPTH:.0f} mm past it: move it with --trocar, or name another --tip"
+            )
+        return best
 
     def _trocars(self, arm: Arm, start: FloatArray) -> list[FloatArray]:
         """Trocars to be tried from a pose: where its shaft crosses the first joint's axis, and HOME_DEPTH from the tip.
@@ -435,17 +430,6 @@ class _Finder:
         crossing = meeting_point(np.stack([point, anchor]), np.stack([into, axis]))
         behind = point + (matmul(tip - point, into) - HOME_DEPTH) * into
         return [behind] if crossing is None else [crossing, behind]
-
-    def _required(
-        self, best: tuple[FloatArray, FloatArray, FloatArray, float] | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        if best is None:
-            what = "the trocar" if self.trocar_given is None else f"the trocar at {vector(self.trocar_given, 4)}"
-            raise ValueError(
-                f"model file {self.survey.path}: no pose was found with the shaft in {what} and the tip "
-                f"{1e3 * HOME_DEPTH:.0f} mm past it: move it with --trocar, or name another --tip"
-            )
-        return best
 
     def _at_depth(self, arm: Arm, trocar: FloatArray, into: FloatArray, start: FloatArray) -> FloatArray | None:
         """Joint values near a start with the tip HOME_DEPTH past the trocar, pointing along the shaft if it can."""
@@ -484,17 +468,14 @@ class _Finder:
     def _blocked(self, arm: Arm, joints: FloatArray) -> bool:
         """Whether the tool passes through a link that neither carries it nor is next to it."""
         carriers = {self.survey.body_name(part) for part in self.survey.parents(self.tool.shaft_body)[:3]}
-        ends = arm.shape_ends(joints)
-        bodies = [arm.model.body(int(arm.model.geom_bodyid[geom])).name for geom in arm.shapes]
-        links = [i for i, felt in enumerate(arm.felt) if not felt and bodies[i] not in carriers]
-        steps = np.linspace(0.0, 1.0, 21)[:, None]
-        for tool in np.flatnonzero(arm.felt):
-            points = ends[tool, 0] + steps * (ends[tool, 1] - ends[tool, 0])
-            for link in links:
-                gap = _distance_to_segment(points, ends[link])
-                if gap.min() < arm.shape_radius[link] + arm.shape_radius[tool]:
-                    return True
-        return False
+        model, data = arm.model, mujoco.MjData(arm.model)
+        arm.write(data, joints)
+        mujoco.mj_kinematics(model, data)
+        links = [geom for geom in arm.shapes[~arm.felt] if model.body(model.geom_bodyid[geom]).name not in carriers]
+        return any(
+            mujoco.mj_geomDistance(model, data, tool, link, ONE_MM, None) < 0.0
+            for tool, link in product(arm.shapes[arm.felt], links)
+        )
 
     # ---- control and the whole -------------------------------------------------------------------------------
 
@@ -612,7 +593,6 @@ class _Finder:
         into: FloatArray,
         reach: float,
     ) -> FoundArm:
-        self.tell("servos", 0.95)
         clipped = home.round(9).clip(self.lower, self.upper)
         arm = self._search_arm(link_shapes)
         control = self._control(arm, clipped)
@@ -625,8 +605,7 @@ class _Finder:
             f"home with the tip {1e3 * HOME_DEPTH:.0f} mm past the trocar; the tip reaches {reach:.0%} of the places "
             f"6 to 14 cm past it, up to {math.degrees(TILT):.0f} degrees aside"
         )
-        self.tell("done", 1.0)
-        return FoundArm(description, self.notes, self.chosen, self.comments, reach)
+        return FoundArm(description, self.notes, self.chosen, reach)
 
 
 def reach_share(arm: Arm, home: FloatArray, into: FloatArray) -> float:
@@ -644,21 +623,9 @@ def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:
     data = mujoco.MjData(arm.model)
     arm.write(data, joints)
     mujoco.mj_forward(arm.model, data)
-    found, unit, product = [], np.zeros(arm.model.nv), np.zeros(arm.model.nv)
-    for dof in arm.dof:
-        unit[:] = 0.0
-        unit[dof] = 1.0
-        mujoco.mj_mulM(arm.model, data, product, unit)
-        found.append(float(product[dof]))
-    return np.array(found)
-
-
-def _distance_to_segment(points: FloatArray, ends: FloatArray) -> FloatArray:
-    """Distances of points (n, 3) from a segment (2, 3) [m], (n,)."""
-    way = ends[1] - ends[0]
-    square = float(matmul(way, way))
-    share = np.clip(matmul(points - ends[0], way) / square, 0.0, 1.0) if square > 0.0 else np.zeros(len(points))
-    return norm(points - ends[0] - share[:, None] * way, axis=1)
+    inertia = np.zeros((arm.model.nv, arm.model.nv))
+    mujoco.mj_fullM(arm.model, data, inertia)
+    return np.diag(inertia)[arm.dof]
 
 
 def _added(name: str, body: str, capsule: Capsule) -> AddedShape:

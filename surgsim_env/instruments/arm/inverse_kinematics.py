@@ -157,15 +157,6 @@ def _judge(arm: Arm, joints: FloatArray, target: Target) -> PoseSolution:
 
 
 def _target(position: ArrayLike, direction: ArrayLike | None, rotation: ArrayLike | None) -> Target:
-    if direction is not None and rotation is not None:
-        raise ValueError("give the tip's direction or its rotation, not both")
-    for what, value, shape in (
-        ("position", position, (3,)),
-        ("direction", direction, (3,)),
-        ("rotation", rotation, (3, 3)),
-    ):
-        if value is not None and (np.shape(value) != shape or not np.isfinite(value).all()):
-            raise ValueError(f"the tip's {what} is {value}; it must be finite and of shape {shape}")
     unit = None if direction is None else np.asarray(direction, dtype=np.float64)
     if unit is not None:
         unit = unit / norm(unit)

@@ -1,7 +1,6 @@
 """An arm's MuJoCo model: read from MJCF or URDF, checked against its description, placed at a port, compiled."""
 
 import math
-import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,13 +17,11 @@ from surgsim_env.instruments.arm.urdf import prepare_urdf
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
-from surgsim_env.scene.model import LENGTH_LARGEST, Port, frame_into
+from surgsim_env.scene.model import Port, frame_into
 
 # Groups of geoms: visual only, outer links for clearances; geoms of CONTACT_GROUP are felt by tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
-# Largest size of a model file and of a mesh file [bytes]: chosen, MuJoCo would read a larger one for minutes.
-FILE_SIZE_MOST = 200_000_000
 # Of shapes that a description adds.
 SHAPE_COLOUR = (0.72, 0.74, 0.78, 1.0)
 
@@ -52,7 +49,6 @@ def compile_arm(
             model = spec.compile()
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
-    _check_lengths(model, where)
     _check_joints(model, description, where)
     return model
 
@@ -90,12 +86,9 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
         dropped_meshes: file names of meshes of a URDF file that are left out.
 
     Raises:
-        ValueError: a file that is missing, too large or wrong; entries for a URDF with an MJCF.
+        ValueError: a file that is missing or wrong; entries for a URDF with an MJCF.
     """
     root = read_xml(path)
-    if root.tag not in ("mujoco", "robot"):
-        raise ValueError(f"model file {path} begins with <{root.tag}>; it must be MJCF (<mujoco>) or URDF (<robot>)")
-    _check_repeated_names(root)
     if root.tag == "robot":
         prepare_urdf(root, path, inertias, dropped_meshes)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
@@ -105,11 +98,6 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
         raise ValueError(f"{name} is for URDF files; model file {path} is MJCF: change it there")
     else:
         spec = mujoco.MjSpec.from_file(str(path))
-    for mesh in spec.meshes:
-        file = path.parent / spec.meshdir / mesh.file
-        if mesh.file and not os.path.isfile(file):
-            raise ValueError(f"mesh file {file} is missing: put it there, or take the mesh out of {path.name}")
-        _check_size(file)
     return spec
 
 
@@ -117,38 +105,14 @@ def read_xml(path: Path) -> ElementTree.Element:
     """The root element of a model file.
 
     Raises:
-        ValueError: a file that cannot be read, is larger than FILE_SIZE_MOST or is no XML.
+        ValueError: a file that cannot be read or is no XML.
     """
     try:
-        _check_size(path)
         return ElementTree.fromstring(path.read_bytes())
     except OSError as error:
         raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
     except ElementTree.ParseError as error:
         raise ValueError(f"model file {path} is not valid XML: {error}") from None
-    except LookupError as error:
-        raise ValueError(f"model file {path} cannot be decoded ({error}): save it as UTF-8") from None
-
-
-def _check_size(file: Path) -> None:
-    size = file.stat().st_size
-    if size > FILE_SIZE_MOST:
-        raise ValueError(f"file {file} has {size} bytes; at most {FILE_SIZE_MOST} are read: reduce it")
-
-
-def _check_repeated_names(root: ElementTree.Element) -> None:
-    """Refuse two parts of the same kind and name, such as two sites "tip"."""
-    if root.tag == "robot":
-        parts = [part for part in root if part.tag in ("link", "joint")]
-    else:
-        worlds = root.findall("worldbody")
-        parts = [part for kind in ("body", "joint", "geom", "site") for world in worlds for part in world.iter(kind)]
-    seen: set[tuple[str, str]] = set()
-    for part in parts:
-        name = part.get("name")
-        if name and (part.tag, name) in seen:
-            raise ValueError(f"two parts <{part.tag}> are named {name!r}; names must differ: rename one")
-        seen.add((part.tag, name or ""))
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
@@ -216,10 +180,6 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         if joint is not None:  # None for one that is held
             joint.range = np.array(limits) / _angle_unit(spec, joint)
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-    for name in (*arm.joints, *arm.jaw):
-        lower, upper = spec.joint(name).range
-        if lower > upper or (lower == upper != 0.0):
-            raise ValueError(f"the limits of joint {name!r} cross: lower {lower:g}, upper {upper:g}; swap them")
     if arm.control.mode == "servo":
         _add_servos(spec, arm)
     _place(spec, arm, port)
@@ -327,30 +287,13 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
         part.set_frame(frame)
 
 
-def _check_lengths(model: mujoco.MjModel, where: str) -> None:
-    """Check that outer shapes and bodies are no larger and no farther than LENGTH_LARGEST; MuJoCo takes any number."""
-    outer, every = np.isin(model.geom_group, (CONTACT_GROUP, LINK_GROUP)), np.ones(model.nbody, dtype=bool)
-    for kind, entry, values, checked in (
-        ("geom", "size", model.geom_size, outer),
-        ("geom", "pos", model.geom_pos, outer),
-        ("body", "pos", model.body_pos, every),
-    ):
-        wrong = np.flatnonzero(checked & ~(np.abs(values) <= LENGTH_LARGEST).all(axis=1))
-        if wrong.size:
-            name = getattr(model, kind)(wrong[0]).name or f"number {wrong[0]}"
-            raise ValueError(
-                f"{where}: {entry} of {kind} {name!r} is {values[wrong[0]].tolist()} m; the rule is at most "
-                f"{LENGTH_LARGEST:g} m: is the model in metres?"
-            )
-
-
 def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:
     """Check that every driven joint has limits around its home position, and a position actuator."""
     for name in (*arm.joints, *arm.jaw):
         joint = model.joint(name)
         lower, upper = joint.range
         if not joint.limited[0]:
-            raise ValueError(f"{where}: joint {name!r} has no limits; give it a range")
+            raise ValueError(f"{where}: joint {name!r} has no limits, or limits that cross; give it a range")
         home = arm.home.get(name)
         if home is not None and not lower - 1e-9 <= home <= upper + 1e-9:
             raise ValueError(

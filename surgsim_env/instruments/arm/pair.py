@@ -17,7 +17,7 @@ from surgsim_env.instruments.arm.arm_instrument import (
     start_direction,
 )
 from surgsim_env.instruments.arm.model import LINK_GROUP, arm_spec, warned
-from surgsim_env.instruments.arm.steering import SteeredArm, millimetres, missing, placed
+from surgsim_env.instruments.arm.steering import SteeredArm
 from surgsim_env.instruments.instrument import Jaw
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ROUGHNESS, SOLIMP, SOLREF, SUPPORT_PREFIX, add_supports
 from surgsim_env.scene.anatomy import Anatomy
@@ -93,13 +93,6 @@ class Pair(SteeredArms):
         aside *= PARKED_ASIDE / norm(aside)
         middle = parked_place(anatomy)
         self.parked = np.stack([middle - aside, middle + aside])
-        for side, place in zip(SIDES, self.parked, strict=True):
-            found = self.arms[side].reach(place)
-            if not placed(found):
-                raise ValueError(
-                    f"{self.arms[side].where} does not reach {millimetres(place)}, before the palpable face of scene "
-                    f"{scene.name!r}: {missing(found)}; move its port"
-                )
         self.place(self.parked)
 
     @property

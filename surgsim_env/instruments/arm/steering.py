@@ -1,5 +1,7 @@
 """Control of one arm of an instrument, alone or one of two: tip velocity to joint speeds by inverse kinematics."""
 
+import math
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -100,11 +102,6 @@ class SteeredArm:
     def joint_positions(self) -> FloatArray:
         """Values of the driven joints [rad or m], (n,)."""
         return self._instrument.data.qpos[self._qpos]
-
-    @property
-    def opening(self) -> float | None:
-        """Gap between the pads of the jaw [m]; None without one."""
-        return None if self.jaw is None else self.jaw.opening
 
     @property
     def trocar_residual(self) -> float:
@@ -221,7 +218,7 @@ class SteeredArm:
 def _jaw_frame(arm: Arm) -> FloatArray:
     """Frame of the open jaw in the tip's frame: -z out of the tip, y between the fingers, (3, 3)."""
     data = mujoco.MjData(arm.model)
-    arm.write(data, arm.home, arm.jaw_range[1])
+    arm.write(data, arm.home, math.fsum(arm.model.joint(name).range[1] for name in arm.description.jaw))
     mujoco.mj_kinematics(arm.model, data)
     first, second = (data.xipos[arm.model.body(arm.model.joint(name).bodyid[0]).id] for name in arm.description.jaw)
     rotation = data.site_xmat[arm.tip_site].reshape(3, 3)

@@ -81,7 +81,7 @@ class ModelSurvey:
         inertias: that were missing or wrong in a URDF and are made up from shapes
         dropped_meshes: of a URDF that are not found or cannot be read
         speed_limits: that a URDF states [rad/s or m/s]
-        spec, model, data: of MuJoCo, at the model's initial joint values
+        model, data: of MuJoCo, at the model's initial joint values
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,8 +111,7 @@ class ModelSurvey:
 
     def _compile(self, inertias: Sequence[LinkInertia]) -> None:
         try:
-            self.spec = read_model(self.path, inertias, self.dropped_meshes)
-            self.model = self.spec.copy().compile()
+            self.model = read_model(self.path, inertias, self.dropped_meshes).compile()
         except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
             raise ValueError(f"model file {self.path}: {' '.join(str(error).split())}") from None
         self.data = mujoco.MjData(self.model)
@@ -155,19 +154,9 @@ class ModelSurvey:
         """Joints that move a body, from the base.
 
         Raises:
-            ValueError: none, or one that is neither a hinge nor a slide.
+            ValueError: there is none.
         """
-        joints = [joint for part in reversed(self.parents(body)) for joint in self.body_joints(part)]
-        for joint in joints:
-            if self.model.jnt_type[joint] not in (HINGE, SLIDE):
-                name = self.model.joint(joint).name
-                raise ValueError(
-                    f"model file {self.path}: joint {name!r} on the way to the tip is neither a hinge nor a slide: "
-                    "take it out (the port places the arm), or name another --tip"
-                )
-            if not self.model.joint(joint).name:
-                link = self.body_name(int(self.model.jnt_bodyid[joint]))
-                raise ValueError(f"model file {self.path}: a joint of body {link!r} has no name: give it one")
+        joints = self._joints_to(body)
         if not joints:
             raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
         return joints

@@ -4,7 +4,6 @@ URDF files refer to meshes by ROS packages or by folders of another computer, an
 zero, which MuJoCo refuses for bodies that move.
 """
 
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
@@ -40,7 +39,6 @@ def prepare_urdf(
     Raises:
         ValueError: a mesh that is not found, a format that MuJoCo does not read, a link or mesh that is not there.
     """
-    _drop_repeated_names(root, path)
     _drop_meshes(root, path, dropped_meshes)
     compiler = root.find("mujoco/compiler")
     if compiler is None:
@@ -97,17 +95,6 @@ def _places(path: Path, name: str, folder: str) -> Iterator[Path]:
     for ending in endings:
         yield from (place.joinpath(*ending) for place in above)
     yield from (place / "meshes" / parts[-1] for place in above)
-
-
-def _drop_repeated_names(root: ElementTree.Element, path: Path) -> None:
-    """Take the names from shapes whose name another has already, as MuJoCo does, with a warning of our own."""
-    seen: set[str] = set()
-    for shape in (shape for link in root.findall("link") for shape in link if shape.tag in ("visual", "collision")):
-        name = shape.get("name", "")
-        if name and name in seen:
-            del shape.attrib["name"]
-            warnings.warn(f"model file {path}: a second shape is named {name!r}; it has no name here", stacklevel=1)
-        seen.add(name)
 
 
 def _drop_meshes(root: ElementTree.Element, path: Path, names: Iterable[str]) -> None:
@@ -179,14 +166,3 @@ def speed_limits(root: ElementTree.Element) -> dict[str, float]:
     limits = {joint.get("name", ""): joint.find("limit") for joint in root.findall("joint")}
     speeds = {name: float(limit.get("velocity", 0.0)) for name, limit in limits.items() if limit is not None}
     return {name: speed for name, speed in speeds.items() if 0.0 < speed < np.inf}
-
-
-def couplings(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
-    """Joints that follow another one by `<mimic>`: its name, the factor and the offset [rad or m]."""
-    found = {}
-    for joint in root.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            factor, offset = float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
-            found[joint.get("name", "")] = (mimic.get("joint", ""), factor, offset)
-    return found

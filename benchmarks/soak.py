@@ -378,7 +378,9 @@ def play_all(seed: int, processes: int, deadline: float, quick: bool, console: C
     show(totals, console)
     for line in (
         f"{len(memory)} runs of seed {seed} in {(time.time() - begin) / 60.0:.1f} min, {count} findings",
-        "memory: too few runs" if gained is None else f"memory: {gained / 1e6:+.1f} MB between runs of a kind"
+        "memory: too few runs"
+        if gained is None
+        else f"memory: {gained / 1e6:+.1f} MB between runs of a kind"
         f" in a process; the rule is at most {GROWTH_MOST / 1e6:.0f} MB",
         describe(before),
     ):

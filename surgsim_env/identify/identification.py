@@ -1,7 +1,6 @@
 """From recorded sets to one material, its errors on held-out sites, and what the data cannot tell."""
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -72,10 +71,6 @@ class IdentifyOptions:
                 f"thickness is {self.thickness:g} m; the rule is 0.5 to 20 radii of the ball ({self.ball_radius:g} m): "
                 "give it in metres, or leave it out and it is searched"
             )
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; the rule is a whole number of at least 0")
-        if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers is {self.workers}; the rule is a whole number of at least 1")
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,6 @@ class Identification:
         relaxation: arms, where presses were held; relative moduli are those of the springs
         other_ratios: for each other Poisson's ratio: error on the training sites, and factor on the modulus
         warnings: what the data cannot tell, one sentence each
-        seconds: wall time
     """
 
     options: IdentifyOptions
@@ -140,7 +134,6 @@ class Identification:
     relaxation: RelaxationFit | None
     other_ratios: dict[float, tuple[float, float]]
     warnings: tuple[str, ...]
-    seconds: float
 
     @property
     def shape(self) -> PressShape:
@@ -184,7 +177,6 @@ def identify(
     Raises:
         ValueError: a set with too few usable sites; says how many are left out and why.
     """
-    begin = time.perf_counter()
     library = make_library(recordings, options) if library is None else library
     sorted_sets = [sort_out(recording.presses) for recording in recordings]
     for recording, (usable, left_out) in zip(recordings, sorted_sets):
@@ -240,8 +232,7 @@ def identify(
             )
         )  # fmt: skip
     result = Identification(
-        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, (),
-        time.perf_counter() - begin,
+        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, ()
     )  # fmt: skip
     return replace(result, warnings=tuple(_warnings(result, library)))
 

@@ -235,10 +235,6 @@ def _names(script: Sequence[Step]) -> list[str]:
     names: list[str] = []
     for step in script:
         base = step.name or type(step).__name__
-        if not base.isprintable():
-            raise ValueError(
-                f"a step is called {base!r}; tables hold a name in one line: leave out what does not print"
-            )
         count = sum((other.name or type(other).__name__) == base for other in script[: len(names)])
         if step.name and step.name in names:
             raise ValueError(f"two steps are called {step.name!r}; the trace is cut by names: give each its own")

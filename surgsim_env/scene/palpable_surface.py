@@ -16,9 +16,6 @@ from msdm_core.mesh.surface import node_normals
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.scene.model import PalpationSettings
 
-# A raster of more points means a spacing in the wrong unit.
-SITES_MOST = 100_000
-
 # A point is open if the face over it is higher by at most this [m]: rounding.
 OPEN_GAP = 1e-6
 
@@ -263,12 +260,6 @@ def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
     """Points of a square grid centred in a rectangle, row by row (boustrophedon), shape (n, 2)."""
-    wanted = float(np.prod((upper - lower) / spacing + 1.0))
-    if not wanted <= SITES_MOST:
-        raise ValueError(
-            f"site spacing {spacing * 1000:g} mm gives {wanted:.3g} raster points; at most {SITES_MOST} are allowed: "
-            "use a larger spacing"
-        )
     axes = []
     for low, high in zip(lower, upper, strict=True):
         count = int((high - low) / spacing)

@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from surgsim_env.cli.values import MaybeCount, MaybeNumber, MaybePath, command_text
+from surgsim_env.cli.values import MaybeNumber, MaybePath, command_text
 from surgsim_env.reports.output_folder import output_folder
 
 
@@ -28,8 +28,6 @@ class Identify:
     """Poisson's ratio of the tissue; presses alone do not tell it."""
     seed: int = 0
     """Seed that draws which half of the sites is fitted."""
-    workers: MaybeCount = None
-    """Number of threads; default: one for each core."""
     out: MaybePath = None
     """Folder for the results; default: the next free runs/identify-NAME-NUMBER."""
 
@@ -52,7 +50,7 @@ class Identify:
 
         if not self.recordings:
             raise ValueError("give a recording: a CSV file with the columns site, depth_mm, normal_force_n")
-        options = IdentifyOptions(self.ball_radius, self.thickness, self.poisson_ratio, self.seed, self.workers)
+        options = IdentifyOptions(self.ball_radius, self.thickness, self.poisson_ratio, self.seed)
         sets = [read_recording(path) for path in self.recordings]
         default = Path("runs") / f"identify-{sets[0].name}"
         with output_folder(self.out or default, results.RESULT_NAMES, numbered=self.out is None) as files:

@@ -52,7 +52,6 @@ class IdentifyOptions:
         thickness: of the tissue on its rigid bed [m]; None: searched.
         poisson_ratio: of the tissue.
         seed: draws the halves of the sites.
-        workers: threads; None: one for each core.
 
     Raises:
         ValueError: names the field, its value and its range.
@@ -62,7 +61,6 @@ class IdentifyOptions:
     thickness: float | None = None
     poisson_ratio: float = 0.45
     seed: int = 0
-    workers: int | None = None
 
     def __post_init__(self) -> None:
         PressSetting(self.ball_radius, 0.1 * self.ball_radius, self.poisson_ratio)
@@ -153,10 +151,7 @@ def make_library(recordings: Sequence[Recording], options: IdentifyOptions) -> P
         # No site can be used: `identify` says why.
         depth = options.ball_radius
     setting = PressSetting(options.ball_radius, depth, options.poisson_ratio)
-    library = PressLibrary(ShapeSpace(options.ball_radius, depth, options.thickness), setting)
-    if options.workers is not None:
-        library.workers = options.workers
-    return library
+    return PressLibrary(ShapeSpace(options.ball_radius, depth, options.thickness), setting)
 
 
 def identify(

@@ -103,9 +103,6 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
     if given and len(given) < len(PLACE):
         raise ValueError(f"recording {path} has {', '.join(given)} of {', '.join(PLACE)}: give all three or none")
     known = (*NEEDED, *given, *([TIME] if TIME in header else []))
-    for name in known:
-        if header.count(name) > 1:
-            raise ValueError(f"recording {path} has {header.count(name)} columns {name!r}; the rule is one")
     return {name: header.index(name) for name in known}
 
 

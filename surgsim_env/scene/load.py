@@ -27,16 +27,15 @@ class _EntryError(dacite.DaciteFieldError):
         return f"{self.field_path}: {self.reason}"
 
 
-def scenes_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
+def scenes_folder() -> Path:
     """The folder with `organs/`, `instruments/` and `meshes/`; as `_shipped_folder`."""
-    return _shipped_folder(package_folder / "assets", package_folder.parent / "scenes", "organs", "scene files")
+    return _shipped_folder(PACKAGE_FOLDER / "assets", PACKAGE_FOLDER.parent / "scenes", "organs", "scene files")
 
 
-def agents_folder(package_folder: Path = PACKAGE_FOLDER) -> Path:
+def agents_folder() -> Path:
     """The folder with `policies/` and `results/` of agents; as `_shipped_folder`."""
-    return _shipped_folder(
-        package_folder / "assets" / "agents", package_folder.parent / "agents", "policies", "policies of agents"
-    )
+    agents = PACKAGE_FOLDER / "assets" / "agents"
+    return _shipped_folder(agents, PACKAGE_FOLDER.parent / "agents", "policies", "policies of agents")
 
 
 def _shipped_folder(packed: Path, checkout: Path, inside: str, what: str) -> Path:
@@ -211,17 +210,13 @@ def list_materials() -> list[str]:
     return sorted(path.stem for path in (scenes_folder() / "materials").glob("*.toml"))
 
 
-def make_material(name: str | Path, *, folder: Path = Path()) -> LibraryMaterial:
+def make_material(name: str | Path) -> LibraryMaterial:
     """The material of a name (see `list_materials`) or of a TOML file's path, with its source.
-
-    Args:
-        name: of a material in the library, or a path that ends in .toml.
-        folder: to which a path is relative.
 
     Raises:
         ValueError: an unknown name (lists the known, suggests the nearest) or a file that breaks the format.
     """
-    path, table = _material_table(name, folder)
+    path, table = _material_table(name, Path())
     return fill(LibraryMaterial, {**table, "name": path.stem}, f"material {path.stem!r}")
 
 

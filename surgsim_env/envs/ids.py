@@ -42,8 +42,8 @@ def register_task(
 ) -> None:
     """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
 
-    The environment takes the arguments of `SurgicalEnv` and the task's own. Registering an id again replaces it: the file
-    of its class can be reloaded.
+    The environment takes the arguments of `SurgicalEnv` and the task's own. Registering an id again replaces it, so
+    that its file can be reloaded.
 
     Args:
         id: "Namespace/Name-v0".

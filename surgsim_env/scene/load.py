@@ -66,11 +66,10 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     """The table in a TOML file; a ValueError names a file that cannot be read, or where it is no valid TOML."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        if isinstance(error, tomllib.TOMLDecodeError | UnicodeDecodeError):
-            raise ValueError(f"{what} file {path} is not valid TOML: {error}") from None
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise ValueError(f"{what} file {path} cannot be read: {reason}") from None
+    except OSError as error:
+        raise ValueError(f"{what} file {path} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{what} file {path} is not valid TOML: {error}") from None
 
 
 def fill(kind: type[Table], table: dict[str, Any], where: str) -> Table:

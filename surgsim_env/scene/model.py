@@ -398,10 +398,8 @@ class ForceSensor:
     hysteresis: float = 0.0
 
     def __post_init__(self) -> None:
-        require_number("sensor.drift", self.drift, 0.0, "N/s")
-        require_number("sensor.hysteresis", self.hysteresis, 0.0, "N")
-        require_number("sensor.noise", self.noise, 0.0, "N")
-        require_number("sensor.bias", self.bias, 0.0, "N")
+        for name, unit in (("drift", "N/s"), ("hysteresis", "N"), ("noise", "N"), ("bias", "N")):
+            require_number(f"sensor.{name}", getattr(self, name), 0.0, unit)
         require_number("sensor.range", self.range, 0.0, "N", above=True)
 
 

@@ -194,9 +194,7 @@ def find_palpable_face(
     direction = np.asarray(approach, dtype=np.float64)
     direction = direction / norm(direction)
     triangles = mesh.boundary_triangles
-    corners = mesh.points[triangles]
-    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area_vector / norm(area_vector, axis=1)[:, None]
+    unit = _unit_normals(mesh.points[triangles])
     chosen = matmul(-unit, direction) >= float(cos(math.radians(palpation.face_angle_deg)))
     if not chosen.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
@@ -220,8 +218,7 @@ def _face_of(
     """The palpable face of some of the boundary triangles, (n_triangle,), against a unit approach (3,)."""
     triangles = mesh.boundary_triangles
     corners = mesh.points[triangles]
-    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area_vector / norm(area_vector, axis=1)[:, None]
+    unit = _unit_normals(corners)
     face = triangles[chosen]
     normals = node_normals(mesh.points, face)
     sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
@@ -242,6 +239,12 @@ def _face_of(
         solid=np.concatenate([mesh.points[mesh.boundary_nodes], *_middles(corners)]),
         tip_radius=tip_radius,
     )
+
+
+def _unit_normals(corners: FloatArray) -> FloatArray:
+    """Unit normals of triangles with given corners (n, 3, 3), shape (n, 3)."""
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return area_vector / norm(area_vector, axis=1)[:, None]
 
 
 def _middles(corners: FloatArray) -> list[FloatArray]:

@@ -246,13 +246,7 @@ class Task:
     @classmethod
     def channel_slices(cls, **sizes: int) -> dict[str, slice]:
         """`observation_slices` without an episode, from the sizes of the channels whose size is a function."""
-        sized: list[tuple[str, int]] = []
-        for channel in cls.channels:
-            size = sizes.get(channel.name, channel.size)
-            if not isinstance(size, int):
-                raise ValueError(f"the size of channel {channel.name!r} depends on the scene: give {channel.name}=SIZE")
-            sized.append((channel.name, size))
-        return _slices(sized)
+        return _slices((channel.name, sizes.get(channel.name, channel.size)) for channel in cls.channels)
 
     @property
     def force_entries(self) -> list[int]:
@@ -583,7 +577,7 @@ def _size(part: Command | Channel, task: Task) -> int:
     return part.size(task) if callable(part.size) else part.size
 
 
-def _slices(sized: Iterable[tuple[str, int]]) -> dict[str, slice]:
+def _slices(sized: Iterable[tuple[str, Any]]) -> dict[str, slice]:
     """Consecutive slices, by name; names of size 0 have none."""
     slices, first = {}, 0
     for name, size in sized:

@@ -20,7 +20,6 @@ from rich.table import Table
 
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.bench.report import describe, load
 from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, PalpationResult, plan_sites, run_palpation
 from surgsim_env.palpation.scene_options import load_stable_anatomy
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
@@ -101,20 +100,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, help="scene files, as `surgsim organ` writes them")
     parser.add_argument("--draws", type=int, default=5)
-    parser.add_argument("--first", type=int, default=0, help="number of the first draw, its seed")
     parser.add_argument("--lesions", type=int, default=3)
     options = parser.parse_args()
-    console, before = Console(width=120), load()
+    console = Console(width=120)
     table = Table("organ", "map", "found", "median error [mm]", "allowed [mm]", "false alarms a run", "sites")
     unexplained = 0
     for file in options.scenes:
         results = []
-        for draw in range(options.first, options.first + options.draws):
+        for draw in range(options.draws):
             results.append(palpate(file, draw, options.lesions, console))
             unexplained += show(file.stem, draw, results[-1], console)
         add_rows(table, file.stem, results)
     console.print(table)
-    console.print(describe(before), markup=False, highlight=False, soft_wrap=True)
     return 1 if unexplained else 0
 
 

@@ -11,15 +11,13 @@ out unless the fault says so, by volumes that are computed here from the nodes' 
 with the first seed must give the first saved state to the bit. Memory is what a process holds between runs, without
 what malloc keeps of freed memory (`memory_held`).
 
-One process for each core (`--processes`); one that dies is a finding, and another takes its place. Prints a table and
-exits 1 with findings.
+One process for each core (`--processes`); one that dies is a finding. Prints a table and exits 1 with findings.
 """
 
 import argparse
 import contextlib
 import ctypes
 import gc
-import itertools
 import multiprocessing
 import os
 import sys
@@ -27,8 +25,9 @@ import time
 import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Generator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -169,10 +168,7 @@ class Run:
 
 @dataclass
 class Outcome:
-    """What a run counted; `findings` are what must not happen, a sentence each.
-
-    `memory` is what the process held after the run, `resident` the same with what malloc kept [bytes].
-    """
+    """What a run counted; `findings` are what must not happen, a sentence each; `memory` held after it [bytes]."""
 
     substeps: int = 0
     steps: int = 0
@@ -180,7 +176,6 @@ class Outcome:
     ends: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
     memory: float = 0.0
-    resident: float = 0.0
 
 
 def play(run: Run) -> Outcome:
@@ -215,8 +210,8 @@ class Watch:
             over = terminated | truncated
             for index, env in enumerate(self.singles):
                 self.count(index, env)
-                told = {name: values[index] for name, values in infos.items() if not name.startswith("_")}
-                end = self.end_of(env, told, bool(truncated[index])) if over[index] else ""
+                info = {name: values[index] for name, values in infos.items() if not name.startswith("_")}
+                end = self.end_of(env, info, bool(truncated[index])) if over[index] else ""
                 self.check_tets(index, env, end)
             forces = infos["force_peak"]
             actions = np.array([actor.send(float(force)) for actor, force in zip(actors, forces, strict=True)])
@@ -312,129 +307,85 @@ def memory_held() -> float:
     return memory_resident()
 
 
+def growth(memory: dict[int, float], processes: int) -> float | None:
+    """Median gain of memory [bytes] between the first and the last run of a kind in one process; None for few pairs.
+
+    Runs of one kind are compared because kinds hold different amounts; the first of each makes what is kept.
+
+    Args:
+        memory: held after each run [bytes], by the run's number.
+        processes: number of processes, which take runs in turn.
+    """
+    held = defaultdict(list)
+    for number in sorted(memory):
+        if number >= KINDS:
+            held[number % processes, number % KINDS].append(memory[number])
+    gained = [of_kind[-1] - of_kind[0] for of_kind in held.values() if len(of_kind) > 1]
+    return float(np.median(gained)) if len(gained) >= 5 else None
+
+
 # ---- processes -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Soak:
-    """What a soak is: its seed, its processes, when it ends (time.time()), and whether it is a quick one."""
-
-    seed: int
-    processes: int
-    deadline: float
-    quick: bool
-
-
-def work(soak: Soak, first: int, pipe: Connection) -> None:
-    """Play every so many-th run from `first` until the deadline; each is announced, and followed by its outcome."""
-    for number in itertools.count(first, soak.processes):
-        if time.time() >= soak.deadline:
-            break
-        run = Run.drawn(soak.seed, number, quick=soak.quick)
-        pipe.send(run)
-        try:
-            outcome = play(run)
-        except Exception:  # whatever it is, it is a finding, and the next run goes on
-            outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
-        outcome.resident = memory_resident()
-        outcome.memory = memory_held()
-        pipe.send(outcome)
-    pipe.send(None)
+def work(run: Run) -> Outcome:
+    """Play a run in a process of the soak."""
+    try:
+        outcome = play(run)
+    except Exception:  # whatever it is, it is a finding, and the next run goes on
+        outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
+    outcome.memory = memory_held()
+    return outcome
 
 
-@dataclass
-class Worker:
-    """A process, its present run, what it held after each run [bytes], by the run's number, and its most resident."""
-
-    process: Any
-    pipe: Connection
-    run: Run | None = None
-    memory: dict[int, float] = field(default_factory=dict)
-    resident: float = 0.0
-    over: bool = False
-
-    def growth(self) -> float | None:
-        """Median over kinds of what was held after the last run over that after the second [bytes]; None for few pairs.
-
-        Runs of one kind are compared because kinds hold different amounts; the first of each makes what is kept.
-        """
-        held = defaultdict(list)
-        for number, memory in self.memory.items():
-            if number >= KINDS:
-                held[number % KINDS].append(memory)
-        gained = [of_kind[-1] - of_kind[0] for of_kind in held.values() if len(of_kind) > 1]
-        return float(np.median(gained)) if len(gained) >= 5 else None
+def make_process() -> ProcessPoolExecutor:
+    """A process of its own for runs one after the other."""
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
 
 
-def start(soak: Soak, first: int) -> Worker:
-    """A process that plays runs from `first` on."""
-    context = multiprocessing.get_context("spawn")
-    mine, its = context.Pipe(duplex=False)
-    process = context.Process(target=work, args=(soak, first, its), daemon=True)
-    process.start()
-    its.close()
-    return Worker(process, mine)
+def play_all(seed: int, processes: int, deadline: float, quick: bool, console: Console) -> int:
+    """Play runs until the deadline (time.time()) and print the table; returns the exit status.
 
-
-def play_all(soak: Soak, console: Console) -> int:
-    """Play until the deadline and print the table; returns the exit status."""
+    Process i of n plays the runs i, i + n, i + 2 n and so on.
+    """
     before, begin = load(), time.time()
-    workers = [start(soak, index) for index in range(soak.processes)]
-    ended: list[Worker] = []
+    pools = [make_process() for _ in range(processes)]
+    playing: dict[Future[Outcome], Run] = {}
     totals: dict[str, Outcome] = {}
-    findings: list[str] = []
+    memory: dict[int, float] = {}
 
-    def find(what: str) -> None:
-        findings.append(what)
-        console.print(f"finding: {what}", markup=False, highlight=False, soft_wrap=True)
+    def submit(number: int) -> None:
+        run = Run.drawn(seed, number, quick=quick)
+        playing[pools[number % processes].submit(work, run)] = run
 
-    with console.status("soak") as status:
-        while workers:
-            for ready in wait([worker.pipe for worker in workers]):
-                worker = next(worker for worker in workers if worker.pipe is ready)
-                try:
-                    message = worker.pipe.recv()
-                except EOFError:
-                    workers.remove(worker)
-                    ended.append(worker)
-                    if not worker.over:
-                        worker.process.join()
-                        find(f"{worker.run}: the process died with exit code {worker.process.exitcode}")
-                        following = worker.run.number + soak.processes if worker.run else 0
-                        workers.append(start(soak, following))
-                    continue
-                if message is None:
-                    worker.over = True
-                elif isinstance(message, Run):
-                    worker.run = message
-                else:
-                    assert worker.run is not None
-                    worker.memory[worker.run.number] = message.memory
-                    worker.resident = max(worker.resident, message.resident)
-                    add(totals.setdefault(worker.run.env_id, Outcome()), message)
-                    for one in message.findings:
-                        find(one)
-                runs = sum(len(worker.memory) for worker in (*workers, *ended))
-                done = sum(total.substeps for total in totals.values())
-                left = max(soak.deadline - time.time(), 0.0)
-                status.update(f"{runs} runs, {done:.3g} substeps, {len(findings)} findings, {left:.0f} s left")
-    memory = []
-    for number, worker in enumerate(ended):
-        held, growth = list(worker.memory.values()), worker.growth()
-        gained = "too few runs to compare" if growth is None else f"{growth / 1e6:+.1f} MB since the kinds repeat"
-        most = f"at most {worker.resident / 1e6:.0f} MB with what malloc kept"
-        memory.append(f"{held[-1] / 1e6 if held else 0.0:.0f} MB at the end, {most}, {gained}")
-        if growth is not None and growth > GROWTH_MOST:
-            find(f"process {number} gained {growth / 1e6:.1f} MB; the rule is {GROWTH_MOST / 1e6:.0f} MB")
+    for number in range(processes):
+        submit(number)
+    while playing:
+        for future in wait(playing, return_when=FIRST_COMPLETED).done:
+            run = playing.pop(future)
+            try:
+                outcome = future.result()
+                memory[run.number] = outcome.memory
+            except BrokenProcessPool:
+                outcome = Outcome(findings=[f"{run}: the process died"])
+                pools[run.number % processes] = make_process()
+            add(totals.setdefault(run.env_id, Outcome()), outcome)
+            for text in outcome.findings:
+                console.print(f"finding: {text}", markup=False, highlight=False, soft_wrap=True)
+            if time.time() < deadline:
+                submit(run.number + processes)
+    gained, count = growth(memory, processes), sum(len(total.findings) for total in totals.values())
+    grown = gained is not None and gained > GROWTH_MOST
     show(totals, console)
-    runs = sum(len(worker.memory) for worker in ended)
     for line in (
-        f"{runs} runs of seed {soak.seed} in {(time.time() - begin) / 60.0:.1f} min, {len(findings)} findings",
-        *(f"process {number}: {text}" for number, text in enumerate(memory)),
+        f"{len(memory)} runs of seed {seed} in {(time.time() - begin) / 60.0:.1f} min, {count} findings",
+        "memory: too few runs"
+        if gained is None
+        else f"memory: {gained / 1e6:+.1f} MB between runs of a kind"
+        f" in a process; the rule is at most {GROWTH_MOST / 1e6:.0f} MB",
         describe(before),
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    return 1 if findings else 0
+    return 1 if count or grown else 0
 
 
 def add(total: Outcome, outcome: Outcome) -> None:
@@ -475,7 +426,7 @@ def main() -> int:
             console.print(one, markup=False, highlight=False, soft_wrap=True)
         return 1 if outcome.findings else 0
     deadline = time.time() + 60.0 * options.minutes
-    return play_all(Soak(options.seed, options.processes, deadline, options.quick), console)
+    return play_all(options.seed, options.processes, deadline, options.quick, console)
 
 
 if __name__ == "__main__":

@@ -110,7 +110,6 @@ HEAVY = {
     "meshio",
     "minari",
     "nibabel",
-    "pettingzoo",
     "pydicom",
     "pytetwild",
     "pyvista",

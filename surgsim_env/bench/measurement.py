@@ -86,13 +86,13 @@ def interleaved(runs: dict[str, Callable[[], float]], rounds: int) -> dict[str, 
     return results
 
 
-def seconds_per_call(call: Callable[[int], object], *, shortest: float = SHORTEST_TIMING) -> float:
+def seconds_per_call(call: Callable[[int], object]) -> float:
     """Processor time of one of `count` repetitions that call(count) makes [s], with a count that lasts long enough."""
     count = 1
     while True:
         begin = time.process_time()
         call(count)
         taken = time.process_time() - begin
-        if taken >= shortest:
+        if taken >= SHORTEST_TIMING:
             return taken / count
-        count = max(2 * count, min(10 * count, math.ceil(1.2 * count * shortest / max(taken, 1e-6))))
+        count = max(2 * count, min(10 * count, math.ceil(1.2 * count * SHORTEST_TIMING / max(taken, 1e-6))))

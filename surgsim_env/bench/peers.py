@@ -152,9 +152,7 @@ def longest_stable(settings: "Iterable[Flex | Newton]") -> Contender:
     raise DivergedError("diverged: " + "; ".join(tried))
 
 
-def fastest_within(
-    base: Flex, force: float, steps: tuple[int, ...], share: float, offset: float = 0.0
-) -> tuple[Flex | None, list[str]]:
+def fastest_within(base: Flex, force: float, steps: tuple[int, ...], share: float) -> tuple[Flex | None, list[str]]:
     """`base` at the step that takes least time while its force stays within a share of a force, and all that was tried.
 
     The steps are multiples of `base`'s, tried once each.
@@ -163,7 +161,7 @@ def fastest_within(
     for multiple in steps:
         flex = replace(base, dt=multiple * base.dt, iterations=LONG_ITERATIONS)
         try:
-            pressed = flex.contender().press(offset)
+            pressed = flex.contender().press(0.0)
         except DivergedError as fault:
             tried.append(f"{1e3 * flex.dt:g} ms: {fault}")
             continue

@@ -97,15 +97,6 @@ class Section:
     figures: list[Figure] = field(default_factory=list)
     closing: str = ""
 
-    def lines(self) -> list[str]:
-        """`name value unit`, one line a figure; names have no blanks."""
-        lines = []
-        for figure in self.figures:
-            name = f"{self.key}/{figure.case}/{figure.quantity}".replace(" ", "_")
-            why = f" ({figure.note})" if figure.value is None else ""
-            lines.append(f"{name} {figure.text} {figure.unit}{why}")
-        return lines
-
     def markdown(self) -> str:
         """Heading, method, and a table: cases down, quantities across, notes last."""
         cases = list(dict.fromkeys(figure.case for figure in self.figures))

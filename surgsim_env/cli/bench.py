@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Bench:
     """Time the tissue, the environments and the start, beside MuJoCo flex and Newton; print and write the figures.
 
-    Prints `name value unit` lines and writes benchmarks.md. Simulators that are not installed are listed as absent.
+    Prints the tables and writes them to benchmarks.md. Simulators that are not installed are listed as absent.
     """
 
     quick: bool = False
@@ -41,8 +41,7 @@ class Bench:
             for measure in measured_parts():
                 section = measure(measurement.QUICK if self.quick else measurement.FULL)
                 sections.append(section)
-                for line in section.lines():
-                    console.print(line, highlight=False, soft_wrap=True, markup=False)
+                console.print(section.markdown(), highlight=False, soft_wrap=True, markup=False)
             report.write_report(sections, report.describe(before), files, quick=self.quick)
         path = folder / report.REPORT_NAME
         console.print(f"written: {path}", highlight=False, soft_wrap=True)

@@ -34,7 +34,6 @@ FEATURES = {
     "docs": "the documentation site (make docs)",
     "live": "the live page (surgsim view)",
     "patient": "label images of scans (surgsim organ)",
-    "pettingzoo": "two agents for the bimanual retraction",
     "tetwild": "surgsim organ --mesher tetwild",
     "video": "films of episodes",
 }

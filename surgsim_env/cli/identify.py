@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from surgsim_env.cli.values import MaybeCount, MaybeNumber, MaybePath, command_text
+from surgsim_env.cli.values import MaybeNumber, MaybePath, command_text
 from surgsim_env.reports.output_folder import output_folder
 
 
@@ -15,7 +15,7 @@ class Identify:
     """Identify a material from recorded presses: modulus, stiffening, relaxation, offset and thickness, with intervals.
 
     Fits half of the sites and reports the error on the other half, beside the best linear tissue. Writes material.toml
-    (for any scene file), sites.csv, curves.png, modulus_map.png and summary.json. See docs/identify.md.
+    (for any scene file), sites.csv and curves.png. See docs/identify.md.
     """
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
@@ -28,8 +28,6 @@ class Identify:
     """Poisson's ratio of the tissue; presses alone do not tell it."""
     seed: int = 0
     """Seed that draws which half of the sites is fitted."""
-    workers: MaybeCount = None
-    """Number of threads; default: one for each core."""
     out: MaybePath = None
     """Folder for the results; default: the next free runs/identify-NAME-NUMBER."""
 
@@ -52,7 +50,7 @@ class Identify:
 
         if not self.recordings:
             raise ValueError("give a recording: a CSV file with the columns site, depth_mm, normal_force_n")
-        options = IdentifyOptions(self.ball_radius, self.thickness, self.poisson_ratio, self.seed, self.workers)
+        options = IdentifyOptions(self.ball_radius, self.thickness, self.poisson_ratio, self.seed)
         sets = [read_recording(path) for path in self.recordings]
         default = Path("runs") / f"identify-{sets[0].name}"
         with output_folder(self.out or default, results.RESULT_NAMES, numbered=self.out is None) as files:
@@ -60,9 +58,6 @@ class Identify:
             results.write_material(found, files / results.MATERIAL_NAME, self.command_line)
             results.write_sites(found, files / results.SITES_NAME)
             results.write_curves(found, files / results.CURVES_NAME)
-            has_map = results.write_map(found, files / results.MAP_NAME)
-            results.write_summary(found, files / results.SUMMARY_NAME, self.command_line)
         results.print_result(found, console)
-        written = [name for name in results.RESULT_NAMES if has_map or name != results.MAP_NAME]
-        console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
+        console.print(f"written: {files.path}/{{{','.join(results.RESULT_NAMES)}}}", highlight=False, soft_wrap=True)
         return 0

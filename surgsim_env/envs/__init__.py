@@ -1,1 +1,1 @@
-"""Gymnasium environments, their ids, vector environments, and interfaces for PettingZoo and stable-baselines3."""
+"""Gymnasium environments, their ids, vector environments, and an interface for stable-baselines3."""

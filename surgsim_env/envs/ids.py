@@ -4,7 +4,6 @@ from functools import cache
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import parse_env_id
 
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
@@ -43,32 +42,15 @@ def register_task(
 ) -> None:
     """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
 
-    The environment takes the arguments of `SurgicalEnv` and the task's own. Registering a class of the same module and
-    name again replaces it, so that its file can be reloaded.
+    The environment takes the arguments of `SurgicalEnv` and the task's own. Registering an id again replaces it, so
+    that its file can be reloaded.
 
     Args:
         id: "Namespace/Name-v0".
         task_class: declares channels and rewards (`surgsim_env.Task`).
         entry_point: "module:class" of the environment, for a task that needs a class of its own.
         vector_entry_point: likewise of the vector environment.
-
-    Raises:
-        TypeError: not a subclass of `Task`, or an entry of its declaration of another type.
-        ValueError: an id that is malformed or belongs to another environment, or a declaration that is incomplete.
     """
-    if not (isinstance(task_class, type) and issubclass(task_class, Task)):
-        raise TypeError(f"{id}: {task_class!r} is no task; give a subclass of surgsim_env.Task")
-    task_class.check_declaration()
-    try:
-        namespace, _, version = parse_env_id(id)
-    except (gym.error.Error, TypeError):
-        namespace = version = None
-    if namespace is None or version is None:
-        raise ValueError(f'id {id!r} is malformed; the rule is "Namespace/Name-v0", such as "MyLab/TracePath-v0"')
-    known = TASKS.get(id)
-    if id in gym.registry and (known is None or _full_name(known) != _full_name(task_class)):
-        owner = gym.registry[id].entry_point if known is None else _full_name(known)
-        raise ValueError(f"id {id!r} belongs to {owner}: choose another name or version")
     TASKS[id] = task_class
     gym.registry.pop(id, None)
     gym.register(
@@ -95,10 +77,6 @@ def environment_class(task_class: type[Task]) -> type[SurgicalEnv]:
             return shipped
     name = task_class.__name__.removesuffix("Task") + "Env"
     return type(name, (SurgicalEnv,), {"task_class": task_class, "__module__": task_class.__module__})
-
-
-def _full_name(task_class: type[Task]) -> str:
-    return f"{task_class.__module__}.{task_class.__qualname__}"
 
 
 def register() -> None:

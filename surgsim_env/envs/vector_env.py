@@ -96,24 +96,11 @@ class LaneVectorEnv(SyncVectorEnv):
         return given
 
     def pause(self, mask: NDArray[np.bool_]) -> None:
-        """Leave the environments that a mask (n,) names as they are in each `step`, until they are reset.
+        """Leave the environments that a mask (n,) names as they are in each `step`, until a reset of mode "Disabled".
 
         A step gives of them the last observation, a reward of 0, False for both ends, and no info; their actions are
         not read. So nothing is computed for lanes whose last episode is over.
-
-        Raises:
-            ValueError: another autoreset mode than "Disabled", in which an episode's end does not begin the next one; a
-                mask that is not one bool per environment.
         """
-        if self.autoreset_mode is not AutoresetMode.DISABLED:
-            raise ValueError(
-                f'autoreset_mode is {self.autoreset_mode.value!r}: only with "Disabled" can environments be paused'
-            )
-        if np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != np.bool_:
-            raise ValueError(
-                f"the mask has shape {np.shape(mask)} of {np.asarray(mask).dtype}; it must be one bool for each of "
-                f"{self.num_envs} environments"
-            )
         self._paused = np.array(mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

@@ -51,7 +51,7 @@ def motion_columns(mark: str = "") -> list[str]:
     return [f"{name}{mark}" for name in ("x", "y", "z", "buttons")]
 
 
-def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int, of_tip: bool = False) -> Motion:
+def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int) -> Motion:
     """Read a file with a header: time [s]; for each hand x, y, z [m] and optionally buttons; other columns are ignored.
 
     In a recording (a file with the tip's place) pauses are gaps in time; the motion has a row for each step of them.
@@ -60,7 +60,6 @@ def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int, 
         path: of the file.
         marks: suffix of the column names of each hand.
         rows_largest: largest number of rows, those of pauses included.
-        of_tip: read the recorded tips in place of the hands.
 
     Raises:
         ValueError: a missing column, a row that is not numeric, invalid buttons, too many rows or none; names the file
@@ -71,7 +70,7 @@ def read_motion(path: Path, marks: Sequence[str] = ("",), *, rows_largest: int, 
         reader = csv.DictReader(file)
         try:
             names = reader.fieldnames or []
-            places, pressed = _columns(names, marks, path.name, TIP if of_tip else "")
+            places, pressed = _columns(names, marks, path.name)
             rows = list(_rows(reader, [*places, *pressed], path.name, rows_largest))
         except csv.Error as error:
             raise ValueError(f"{path.name}, line {reader.line_num + 1}: {error}; it is not a CSV file") from None
@@ -105,9 +104,9 @@ def _with_pauses(motion: Motion, file_name: str, rows_largest: int) -> Motion:
     return Motion(time, position, buttons.astype(np.int32), recorded=True)
 
 
-def _columns(names: Sequence[str], marks: Sequence[str], file_name: str, of: str) -> tuple[list[str], list[str]]:
+def _columns(names: Sequence[str], marks: Sequence[str], file_name: str) -> tuple[list[str], list[str]]:
     """The columns of time and positions, and those of buttons that exist."""
-    places = ["time", *(f"{of}{name}" for mark in marks for name in motion_columns(mark)[:3])]
+    places = ["time", *(name for mark in marks for name in motion_columns(mark)[:3])]
     pressed = [motion_columns(mark)[3] for mark in marks]
     missing = [name for name in places if name not in names]
     if missing:

@@ -1,7 +1,6 @@
 """From recorded sets to one material, its errors on held-out sites, and what the data cannot tell."""
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -53,7 +52,6 @@ class IdentifyOptions:
         thickness: of the tissue on its rigid bed [m]; None: searched.
         poisson_ratio: of the tissue.
         seed: draws the halves of the sites.
-        workers: threads; None: one for each core.
 
     Raises:
         ValueError: names the field, its value and its range.
@@ -63,7 +61,6 @@ class IdentifyOptions:
     thickness: float | None = None
     poisson_ratio: float = 0.45
     seed: int = 0
-    workers: int | None = None
 
     def __post_init__(self) -> None:
         PressSetting(self.ball_radius, 0.1 * self.ball_radius, self.poisson_ratio)
@@ -72,10 +69,6 @@ class IdentifyOptions:
                 f"thickness is {self.thickness:g} m; the rule is 0.5 to 20 radii of the ball ({self.ball_radius:g} m): "
                 "give it in metres, or leave it out and it is searched"
             )
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; the rule is a whole number of at least 0")
-        if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers is {self.workers}; the rule is a whole number of at least 1")
 
 
 @dataclass(frozen=True)
@@ -127,7 +120,6 @@ class Identification:
         relaxation: arms, where presses were held; relative moduli are those of the springs
         other_ratios: for each other Poisson's ratio: error on the training sites, and factor on the modulus
         warnings: what the data cannot tell, one sentence each
-        seconds: wall time
     """
 
     options: IdentifyOptions
@@ -140,7 +132,6 @@ class Identification:
     relaxation: RelaxationFit | None
     other_ratios: dict[float, tuple[float, float]]
     warnings: tuple[str, ...]
-    seconds: float
 
     @property
     def shape(self) -> PressShape:
@@ -160,10 +151,7 @@ def make_library(recordings: Sequence[Recording], options: IdentifyOptions) -> P
         # No site can be used: `identify` says why.
         depth = options.ball_radius
     setting = PressSetting(options.ball_radius, depth, options.poisson_ratio)
-    library = PressLibrary(ShapeSpace(options.ball_radius, depth, options.thickness), setting)
-    if options.workers is not None:
-        library.workers = options.workers
-    return library
+    return PressLibrary(ShapeSpace(options.ball_radius, depth, options.thickness), setting)
 
 
 def identify(
@@ -184,7 +172,6 @@ def identify(
     Raises:
         ValueError: a set with too few usable sites; says how many are left out and why.
     """
-    begin = time.perf_counter()
     library = make_library(recordings, options) if library is None else library
     sorted_sets = [sort_out(recording.presses) for recording in recordings]
     for recording, (usable, left_out) in zip(recordings, sorted_sets):
@@ -240,8 +227,7 @@ def identify(
             )
         )  # fmt: skip
     result = Identification(
-        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, (),
-        time.perf_counter() - begin,
+        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, ()
     )  # fmt: skip
     return replace(result, warnings=tuple(_warnings(result, library)))
 

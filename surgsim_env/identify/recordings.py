@@ -63,16 +63,6 @@ class Recording:
     name: str
     presses: tuple[SitePress, ...]
 
-    @property
-    def has_time(self) -> bool:
-        """Whether the samples have times."""
-        return self.presses[0].time is not None
-
-    @property
-    def has_places(self) -> bool:
-        """Whether all sites have a place."""
-        return all(np.isfinite(press.place).all() for press in self.presses)
-
 
 def read_recording(path: Path) -> Recording:
     """Read a set from a CSV file with the columns that this module lists.
@@ -113,9 +103,6 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
     if given and len(given) < len(PLACE):
         raise ValueError(f"recording {path} has {', '.join(given)} of {', '.join(PLACE)}: give all three or none")
     known = (*NEEDED, *given, *([TIME] if TIME in header else []))
-    for name in known:
-        if header.count(name) > 1:
-            raise ValueError(f"recording {path} has {header.count(name)} columns {name!r}; the rule is one")
     return {name: header.index(name) for name in known}
 
 

@@ -27,6 +27,8 @@ ONSET_RANGE, WIDTH_RANGE, CAP_RANGE = (0.0, 0.2), (0.05, 0.25), (2.0, 80.0)
 SPREAD_COUNT, SPREAD_COUNT_LAW, LINEAR_COUNT = 56, 32, 6
 # Rounds in which the best shapes are pressed themselves, and how many in each.
 ROUNDS, ROUND_COUNT = 3, 4
+# Distance between the best shapes that are pressed, in the unit box of shapes.
+APART = 0.25
 # Shapes that are looked at by interpolation.
 LOOKED_AT = 768
 # Training sites that choose the shape at most.
@@ -98,12 +100,10 @@ class PressLibrary:
     Fields:
         space: the shapes that are searched
         setting: of the presses
-        workers: threads; the organ's kernels leave the interpreter free
     """
 
     space: ShapeSpace
     setting: PressSetting
-    workers: int = field(default_factory=core_count)
     points: list[FloatArray] = field(default_factory=list)
     curves: list[PressCurve] = field(default_factory=list)
     linear_places: list[float] = field(default_factory=list)
@@ -141,7 +141,7 @@ class PressLibrary:
     def press(self, shapes: Sequence[PressShape], progress: Progress = lambda: None) -> list[PressCurve | None]:
         """A curve for each shape, None where the press fails."""
         found: list[PressCurve | None] = [None] * len(shapes)
-        with ThreadPoolExecutor(self.workers) as pool:
+        with ThreadPoolExecutor(core_count()) as pool:
             asked = {pool.submit(press_block, shape, self.setting): place for place, shape in enumerate(shapes)}
             try:
                 for done in as_completed(asked):
@@ -197,17 +197,11 @@ class FoundShape:
     Fields:
         shape, curve: thickness and law, and its run
         intervals: of each parameter that was searched, by its name
-        training_count: sites that chose the shape
-        cost: mean error of the training sites but the worst
-        press_count: runs of the forward model so far
     """
 
     shape: PressShape
     curve: SampledCurve
     intervals: dict[str, Interval]
-    training_count: int
-    cost: float
-    press_count: int
 
 
 def trimmed_mean(errors: FloatArray) -> FloatArray:
@@ -256,9 +250,6 @@ def find_shape(
         shape=shape,
         curve=library.sampled(library.curves[best]),
         intervals=_intervals(library, parts, best, looked_at),
-        training_count=errors.shape[1],
-        cost=float(trimmed_mean(errors)[best]),
-        press_count=len(library.curves) + len(library.linear_curves) + len(library.failed),
     )
 
 
@@ -268,11 +259,11 @@ def _at_most(part: SiteSamples, count: int, rng: np.random.Generator) -> SiteSam
     return part.subset(np.sort(rng.choice(len(part), count, replace=False)))
 
 
-def _apart(points: FloatArray, costs: FloatArray, count: int, distance: float = 0.25) -> list[int]:
-    """The best points that are apart from each other."""
+def _apart(points: FloatArray, costs: FloatArray, count: int) -> list[int]:
+    """The best points that are farther than APART from each other."""
     chosen: list[int] = []
     for place in np.argsort(costs):
-        if all(np.linalg.norm(points[place] - points[other]) > distance for other in chosen):
+        if all(np.linalg.norm(points[place] - points[other]) > APART for other in chosen):
             chosen.append(int(place))
             if len(chosen) == count:
                 break

@@ -9,7 +9,6 @@ deeper two thirds of the press.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,9 +185,6 @@ def _fault(site: SitePress, usual: float) -> str:
 def depth_largest(sites: Sequence[SitePress]) -> float:
     """Depth of the deepest press of some sites [m]; 0 for none."""
     return max((float(site.depth.max()) for site in sites), default=0.0)
-
-
-Half = Literal["training", "held out"]
 
 
 def draw_halves(count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

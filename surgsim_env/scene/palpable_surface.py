@@ -16,9 +16,6 @@ from msdm_core.mesh.surface import node_normals
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.scene.model import PalpationSettings
 
-# A raster of more points means a spacing in the wrong unit.
-SITES_MOST = 100_000
-
 # A point is open if the face over it is higher by at most this [m]: rounding.
 OPEN_GAP = 1e-6
 
@@ -197,9 +194,7 @@ def find_palpable_face(
     direction = np.asarray(approach, dtype=np.float64)
     direction = direction / norm(direction)
     triangles = mesh.boundary_triangles
-    corners = mesh.points[triangles]
-    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area_vector / norm(area_vector, axis=1)[:, None]
+    unit = _unit_normals(mesh.points[triangles])
     chosen = matmul(-unit, direction) >= float(cos(math.radians(palpation.face_angle_deg)))
     if not chosen.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
@@ -223,8 +218,7 @@ def _face_of(
     """The palpable face of some of the boundary triangles, (n_triangle,), against a unit approach (3,)."""
     triangles = mesh.boundary_triangles
     corners = mesh.points[triangles]
-    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area_vector / norm(area_vector, axis=1)[:, None]
+    unit = _unit_normals(corners)
     face = triangles[chosen]
     normals = node_normals(mesh.points, face)
     sides = np.sort(np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]]), axis=1)
@@ -247,6 +241,12 @@ def _face_of(
     )
 
 
+def _unit_normals(corners: FloatArray) -> FloatArray:
+    """Unit normals of triangles with given corners (n, 3, 3), shape (n, 3)."""
+    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return area_vector / norm(area_vector, axis=1)[:, None]
+
+
 def _middles(corners: FloatArray) -> list[FloatArray]:
     """Middles of the edges and of the triangles with given corners (n, 3, 3) [m], four arrays (n, 3)."""
     edges = [0.5 * (corners[:, side] + corners[:, side - 1]) for side in range(3)]
@@ -263,12 +263,6 @@ def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
     """Points of a square grid centred in a rectangle, row by row (boustrophedon), shape (n, 2)."""
-    wanted = float(np.prod((upper - lower) / spacing + 1.0))
-    if not wanted <= SITES_MOST:
-        raise ValueError(
-            f"site spacing {spacing * 1000:g} mm gives {wanted:.3g} raster points; at most {SITES_MOST} are allowed: "
-            "use a larger spacing"
-        )
     axes = []
     for low, high in zip(lower, upper, strict=True):
         count = int((high - low) / spacing)

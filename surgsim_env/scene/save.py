@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import tomlkit
 from tomlkit.items import AbstractTable, Item, Table
@@ -29,7 +29,7 @@ def scene_toml(scene: Scene, *, head: Sequence[str] = (), comments: Mapping[str,
             "regions.material" is for each of the regions.
 
     Raises:
-        ValueError: a comment's path names no field; a field is None while its default is not (TOML has no null).
+        ValueError: a field is None while its default is not (TOML has no null).
     """
     return _toml(scene, head, comments or {})
 
@@ -43,31 +43,16 @@ def arm_toml(
         description: to be written.
         head: comment lines at the top.
         comments: texts by the path of their entry or table, such as "trocar.point".
-
-    Raises:
-        ValueError: a comment's path names no field.
     """
     return _toml(description, head, comments or {})
 
 
 def _toml(values: Scene | ArmDescription, head: Sequence[str], comments: Mapping[str, str]) -> str:
-    for path in comments:
-        _check_path(path, type(values))
     document = tomlkit.document()
     for line in head:
         document.add(tomlkit.comment(_printable(line)))
     _fill(document, values, "", comments)
     return tomlkit.dumps(document)
-
-
-def _check_path(path: str, root: type) -> None:
-    """Refuse a comment that would be lost, as there is no field at its path."""
-    kind: Any = root
-    for name in re.sub(r"\[\d+\]", "", path).split("."):
-        hints = get_type_hints(kind) if is_dataclass(kind) else {}
-        if name not in hints:
-            raise ValueError(f"the comment at {path!r} is for no field of a {root.__name__}")
-        kind = next((part for part in (hints[name], *get_args(hints[name])) if is_dataclass(part)), None)
 
 
 def _fill(table: tomlkit.TOMLDocument | AbstractTable, values: Any, path: str, comments: Mapping[str, str]) -> None:
@@ -123,12 +108,7 @@ def _default(one: Field) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A value as TOML holds it: tuples as lists, and no halves of surrogate pairs.
-
-    Python has such halves for the bytes of file names that are not UTF-8; they become the replacement character.
-    """
-    if isinstance(value, str):
-        return re.sub("[\ud800-\udfff]", "\ufffd", value)
+    """A value as TOML holds it: tuples as lists."""
     return [_plain(one) for one in value] if isinstance(value, tuple) else value
 
 

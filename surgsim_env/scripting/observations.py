@@ -24,10 +24,3 @@ def selected_observations(observations: Any, index: Any) -> Any:
     if isinstance(observations, dict):
         return {name: part[index] for name, part in observations.items()}
     return observations[index]
-
-
-def make_read_only(value: Any) -> None:
-    """Make an array, or each array of a dictionary, read-only; another value stays as it is."""
-    for part in value.values() if isinstance(value, dict) else (value,):
-        if isinstance(part, np.ndarray):
-            part.flags.writeable = False

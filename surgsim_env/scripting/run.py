@@ -25,9 +25,7 @@ class ScriptError(Exception):
         self.trace = trace
 
 
-def run_script(
-    env: gym.Env, script: Script, *, seed: int | None = None, observation: Observation | None = None
-) -> Trace:
+def run_script(env: gym.Env, script: Script, *, seed: int | None = None) -> Trace:
     """Run the steps of a script one after the other and record everything; recording changes no bit of the episode.
 
     The episode may end in the last step if that is one of those made for it (Declare, Control, AwaitEnd), and may end
@@ -38,7 +36,6 @@ def run_script(
         env: one environment of this project, wrapped or not.
         script: steps; those without a name of their own are called after their class, from the second on "Hold 2".
         seed: resets the environment first; without it the run continues from the environment's present state.
-        observation: the first one of a controller, where nothing is reset and a wrapper changes observations.
 
     Raises:
         ScriptError: a step ran out of time or depth, or the episode ended too soon; its `trace` is the run so far.
@@ -54,10 +51,7 @@ def run_script(
                 f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
                 f"{task.speed_limit:g} m/s: ask for that or less"
             )
-    if seed is not None:
-        observation, _ = env.reset(seed=seed)
-    elif observation is None:
-        observation = inner.observation
+    observation = inner.observation if seed is None else env.reset(seed=seed)[0]
     with inner.simulation.recording() as record:
         run = _Run(env, inner, task, record, observation, inner.simulation.time)
         failure = ""
@@ -235,10 +229,6 @@ def _names(script: Sequence[Step]) -> list[str]:
     names: list[str] = []
     for step in script:
         base = step.name or type(step).__name__
-        if not base.isprintable():
-            raise ValueError(
-                f"a step is called {base!r}; tables hold a name in one line: leave out what does not print"
-            )
         count = sum((other.name or type(other).__name__) == base for other in script[: len(names)])
         if step.name and step.name in names:
             raise ValueError(f"two steps are called {step.name!r}; the trace is cut by names: give each its own")

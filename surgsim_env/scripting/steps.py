@@ -4,19 +4,16 @@ import copy
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
-from surgsim_env.haptics.trajectory import ROWS_LARGEST, TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
-from surgsim_env.scripting.observations import make_read_only
 from surgsim_env.tasks.task import Task
 
 Action = NDArray[np.floating]
@@ -70,10 +67,6 @@ class View:
     arm: str = ""
     arms: Mapping[str, "View"] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for value in vars(self).values():
-            make_read_only(value)
-
     def action(self, velocity: FloatArray, **commands: Any) -> Action:
         """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`).
 
@@ -117,17 +110,6 @@ class View:
                 f"{type(step).__name__} needs an instrument with a jaw; this one has none: choose a grasper"
             )
         return self.grasp
-
-    def of(self, arm: str) -> "View":
-        """The view of one of several arms.
-
-        Raises:
-            ValueError: there is no such arm (says which there are).
-        """
-        if arm not in self.arms:
-            known = ", ".join(self.arms) or "none: the instrument is one alone"
-            raise ValueError(f"arm {arm!r} is not there; the arms are {known}")
-        return self.arms[arm]
 
     def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
         """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
@@ -189,7 +171,10 @@ Script = Sequence[Step]
 class _Checked:
     """A step that does not move the tip and does not end the episode, unless a subclass says otherwise.
 
-    Its numbers are finite and above 0; its point and its direction are checked too.
+    Its numbers are finite and above 0; its direction is brought to length 1.
+
+    Raises:
+        ValueError: names the step, the field and the value.
     """
 
     ends_episode = False
@@ -198,12 +183,13 @@ class _Checked:
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
-            if one.type is float:
-                above_zero(self, one.name, value)
-            elif one.name == "point":
-                object.__setattr__(self, "point", point_of(self, "point", value))
-            elif one.name == "direction" and value is not None:
-                object.__setattr__(self, "direction", unit_vector(self, "direction", value))
+            if one.type is float and not 0.0 < value < math.inf:
+                raise ValueError(
+                    f"{type(self).__name__}: {one.name} is {value!r}; it must be a finite number above 0, in SI units "
+                    "(metres, newtons, seconds)"
+                )
+            if one.name == "direction" and value is not None:
+                object.__setattr__(self, "direction", tuple((np.array(value) / norm(value)).tolist()))
 
 
 @dataclass(frozen=True)
@@ -235,75 +221,6 @@ class MoveTo(_Checked):
 
 
 @dataclass(frozen=True)
-class Follow(_Checked):
-    """Move the tip along a recording's path at its pace: of the tip that `surgsim view` recorded, or time, x, y, z [m].
-
-    It goes to the path's beginning first. It fails where the tip is farther than `tolerance` [m] from where it was at
-    that time, such as on a path faster than `speed` [m/s]. In a pause the tip goes on as recorded; buttons do nothing.
-    """
-
-    path: Path
-    arm: int = 1  # of a recording of two: 1 or 2
-    speed: float = 0.02
-    tolerance: float = 0.005
-    timeout: float = 600.0
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.arm not in (1, 2):
-            raise ValueError(f"Follow: arm is {self.arm!r}; it must be 1 or 2")
-        object.__setattr__(self, "path", Path(self.path))
-
-    def actions(self, view: View) -> Plan:
-        """To the first place, then each control step to where the tip was at its end.
-
-        Raises:
-            ValueError: a file that is no recording and no trajectory; names the line.
-        """
-        time, places = _recorded_path(self.path, "" if self.arm == 1 else f"_{self.arm}")
-        view = yield from _all_of(MoveTo(tuple(places[0].tolist()), self.speed), view)
-        begun = view.time
-        while (now := view.time - begun) < time[-1]:
-            there = np.array([np.interp(now, time, column) for column in places.T])
-            if (missed := float(norm(there - view.tip_position))) > self.tolerance:
-                raise StepFailed(f"was {missed * 1e3:.1f} mm from the path of {self.path.name} at {now:.2f} s of it")
-            ahead = np.array([np.interp(now + view.control_step, time, column) for column in places.T])
-            way = ahead - view.tip_position
-            distance = float(norm(way))
-            pace = min(self.speed, distance / view.control_step)
-            view = yield view.action(way * (pace / distance) if distance > 0.0 else np.zeros(3))
-
-
-def _recorded_path(path: Path, mark: str) -> tuple[FloatArray, FloatArray]:
-    """Times from 0 [s] (n,) and places [m] (n, 3) of a tip that was recorded, else of a hand without pauses."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        of_tip = f"{TIP}x{mark}" in file.readline().strip().split(",")
-    motion = read_motion(path, (mark,), rows_largest=ROWS_LARGEST, of_tip=of_tip)
-    known = ~np.isnan(motion.position[:, 0]).all(axis=1) | (not motion.recorded)
-    time, places = motion.time[known], motion.position[known, 0]
-    wrong = np.flatnonzero(~(np.isfinite(time) & np.isfinite(places).all(axis=1)))
-    if len(wrong):
-        raise ValueError(f"{path.name}, row {wrong[0]}: a number is not finite; leave the row out")
-    if (np.diff(time) <= 0.0).any():
-        row = int(np.flatnonzero(np.diff(time) <= 0.0)[0]) + 1
-        raise ValueError(f"{path.name}, row {row}: time {time[row]:g} s is not after that of the row before")
-    return time - time[0], places
-
-
-def _all_of(step: "Step", view: View) -> Generator[Action, View, View]:
-    """The actions of a step within another one; returns the last view."""
-    plan = step.actions(view)
-    try:
-        action = next(plan)
-        while True:
-            view = yield action
-            action = plan.send(view)
-    except StopIteration:
-        return view
-
-
-@dataclass(frozen=True)
 class PressUntil(_Checked):
     """Press until the tissue pushes back with `force` [N], less `tolerance`, at most `max_depth` [m] past contact.
 
@@ -319,14 +236,6 @@ class PressUntil(_Checked):
     tolerance: float = 0.01
     timeout: float = 10.0
     name: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.tolerance >= self.force:
-            raise ValueError(
-                f"PressUntil: tolerance is {self.tolerance:g} N with a force of {self.force:g} N; "
-                "it must be smaller than the force: give a smaller one"
-            )
 
     def actions(self, view: View) -> Plan:
         """Into the tissue, in steps that are not meant to exceed the force."""
@@ -387,10 +296,6 @@ class WaitUntil(_Checked):
     timeout: float
     name: str = ""
 
-    def __post_init__(self) -> None:
-        callable_for(self, "predicate", "a function of the view")
-        super().__post_init__()
-
     def actions(self, view: View) -> Plan:
         """No motion."""
         while not self.predicate(view):
@@ -438,12 +343,6 @@ class Control(_Checked):
     until: Predicate | None = field(default=None, repr=False)
     name: str = ""
     ends_episode = True
-
-    def __post_init__(self) -> None:
-        callable_for(self, "controller", "called with an observation, gives an action")
-        if self.until is not None:
-            callable_for(self, "until", "a function of the view")
-        super().__post_init__()
 
     def actions(self, view: View) -> Plan:
         """The controller's actions."""
@@ -568,12 +467,12 @@ class OfArm(_Wrapped):
 
     def actions(self, view: View) -> Plan:
         """The step's actions, from that arm's view."""
-        plan = self.step.actions(view.of(self.arm))
+        plan = self.step.actions(view.arms[self.arm])
         try:
             action = next(plan)
             while True:
                 view = yield action
-                action = plan.send(view.of(self.arm))
+                action = plan.send(view.arms[self.arm])
         except StopIteration:
             return
 
@@ -583,9 +482,6 @@ class Until(_Wrapped):
     """Another step, which is over as soon as `predicate(view)` is true, or by itself."""
 
     predicate: Predicate = field(repr=False)
-
-    def __post_init__(self) -> None:
-        callable_for(self, "predicate", "a function of the view")
 
     def actions(self, view: View) -> Plan:
         """The step's actions until the predicate is true."""
@@ -622,60 +518,3 @@ class Tracked(_Wrapped):
                 action = plan.send(view.from_surface(shift, shift if contact_shift is None else contact_shift))
         except StopIteration:
             return
-
-
-# ---- checks of the fields -------------------------------------------------------------------------------------------
-
-
-def above_zero(step: Any, field: str, value: object) -> None:
-    """The field is a finite number above 0.
-
-    Raises:
-        ValueError: names the step, the field and the value.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value < math.inf:
-        raise ValueError(
-            f"{type(step).__name__}: {field} is {value!r}; it must be a finite number above 0, in SI units "
-            "(metres, newtons, seconds)"
-        )
-
-
-def point_of(step: Any, field: str, value: ArrayLike) -> tuple[float, float, float]:
-    """Three finite coordinates.
-
-    Raises:
-        ValueError: names the step, the field and the value.
-    """
-    try:
-        point = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        point = np.zeros(0)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"{type(step).__name__}: {field} is {value!r}; it must be three finite numbers, x, y and z")
-    x, y, z = point.tolist()
-    return x, y, z
-
-
-def unit_vector(step: Any, field: str, value: ArrayLike) -> tuple[float, float, float]:
-    """A direction at length 1.
-
-    Raises:
-        ValueError: not three finite numbers, or all of them 0.
-    """
-    vector = np.array(point_of(step, field, value))
-    length = float(norm(vector))
-    if not 0.0 < length < math.inf:
-        raise ValueError(f"{type(step).__name__}: {field} is {value!r}; it must point somewhere: (0, 0, -1) is down")
-    x, y, z = (vector / length).tolist()
-    return x, y, z
-
-
-def callable_for(step: Any, field: str, what: str) -> None:
-    """The field can be called.
-
-    Raises:
-        TypeError: names the step, the field and the value.
-    """
-    value = getattr(step, field)
-    if not callable(value):
-        raise TypeError(f"{type(step).__name__}: {field} is {value!r}; it must be callable: {what}")

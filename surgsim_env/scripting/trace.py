@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import matmul
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.envs.surgical_env import Observation
-from surgsim_env.scripting.observations import make_read_only, selected_observations
+from surgsim_env.scripting.observations import selected_observations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,7 @@ class StepInterval:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A run of a script; arrays cannot be written to.
+    """A run of a script.
 
     Fields:
         start: when it began [s] since the episode's reset, as all times here
@@ -67,10 +67,6 @@ class Trace:
     truncated: bool
     failure: str
 
-    def __post_init__(self) -> None:
-        for value in vars(self).values():
-            make_read_only(value)
-
     @property
     def force(self) -> FloatArray:
         """Sum of the tissue's force over all tools at each haptic step [N], shape (n, 3)."""
@@ -100,11 +96,9 @@ class Trace:
         """The part of the run from step `first` to the end of step `last` (or of the same), by their names.
 
         Raises:
-            ValueError: no step has that name (says which there are), or `last` comes before `first`.
+            ValueError: no step has that name (says which there are).
         """
         begin, end = self._index(first), self._index(first if last is None else last)
-        if end < begin:
-            raise ValueError(f"step {last!r} comes before {first!r}: swap them")
         start, stop = self.steps[begin].start, self.steps[end].end
         haptic, control = _within(self.haptic_time, start, stop), _within(self.control_time, start, stop)
         at_haptic_rate = ("haptic_time", "wrench", "tip_position", "tip_orientation", "depth")
@@ -121,30 +115,20 @@ class Trace:
         """Write haptic rate to `path` and control rate beside it (`run.csv`, `run_control.csv`); both paths.
 
         Columns name their units; numbers are written in full, so that reading them gives the same bits.
-
-        Raises:
-            ValueError: the path does not end in ".csv".
         """
         path = Path(path)
-        if path.suffix != ".csv":
-            raise ValueError(
-                f'{str(path)!r} does not end in ".csv"; a second table is written beside it: name it run.csv'
-            )
         beside = path.with_name(f"{path.stem}_control.csv")
         _write(path, _haptic_rows(self))
         _write(beside, _control_rows(self))
         return path, beside
 
-    def plot(self, where: str | Path | tuple[Axes, Axes]) -> None:
-        """Draw force and depth over time, the steps marked: into a picture file, or into two axes of your own."""
-        if isinstance(where, str | Path):
-            from matplotlib.figure import Figure
+    def plot(self, path: str | Path) -> None:
+        """Draw force and depth over time, the steps marked, into a picture file."""
+        from matplotlib.figure import Figure
 
-            figure = Figure(figsize=(10.0, 5.6), dpi=110, facecolor="white", layout="constrained")
-            _draw(self, *figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0)))
-            figure.savefig(where)
-        else:
-            _draw(self, *where)
+        figure = Figure(figsize=(10.0, 5.6), dpi=110, facecolor="white", layout="constrained")
+        _draw(self, *figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0)))
+        figure.savefig(path)
 
     def step_names(self, times: FloatArray) -> list[str]:
         """The step of the script that each time [s] belongs to."""

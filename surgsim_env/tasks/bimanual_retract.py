@@ -37,8 +37,6 @@ COLLISION_FORCE = 2.0
 NEAR = 0.10
 # Bound of the arms' distance [m], which is computed up to 50 mm.
 DISTANCE_BOUND = 0.1
-# Entries of an action: the left arm's velocity, turning and jaw, then the right one's velocity and turning.
-LEFT_SIZE, RIGHT_SIZE = 7, 6
 
 
 def _right(simulation: Simulation) -> Any:
@@ -51,8 +49,7 @@ class BimanualRetractTask(RetractTask):
     ## Description
     The lobe of `SurgSim/Retract-v0` hides a disc on its bed. The left of two robot arms grasps the lobe and folds it
     back; the right one reaches under it and touches the disc gently for half a second. Tissue, bed and arms exchange
-    forces 1000 times a second; one agent commands both arms 20 times a second. `surgsim_env.envs.bimanual_parallel` is
-    the same for two agents.
+    forces 1000 times a second; one agent commands both arms 20 times a second.
 
     ## Action Space
     `Box(-1, 1, (13,), float32)`

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from surgsim_env.coupling.simulation import Simulation
@@ -50,14 +49,6 @@ class Command:
     meaning: str = ""
     size_text: str = "by the scene"
 
-    def __post_init__(self) -> None:
-        _check_part("command", self, self.size)
-        if not 0.0 < self.scale < math.inf:
-            raise ValueError(
-                f"command {self.name!r}: scale is {self.scale!r}; it is the SI value of an entry of 1: give a finite "
-                "number above 0"
-            )
-
 
 @dataclass(frozen=True, eq=False)
 class Channel:
@@ -95,7 +86,6 @@ class Channel:
     scale_text: str = "by the scene"
 
     def __post_init__(self) -> None:
-        _check_part("channel", self, self.size)
         if self.scale is None:
             if self.unit:
                 raise ValueError(
@@ -103,18 +93,6 @@ class Channel:
                     "a network reads numbers of order 1"
                 )
             object.__setattr__(self, "scale", 1.0)
-        if not callable(self.scale):
-            scale = np.asarray(self.scale, dtype=np.float64)
-            if not (np.isfinite(scale).all() and (scale > 0.0).all()):
-                raise ValueError(
-                    f"channel {self.name!r}: scale is {self.scale!r}; it is the value that is observed as 1: give "
-                    "finite numbers above 0"
-                )
-        if not callable(self.read):
-            raise ValueError(
-                f"channel {self.name!r}: read is {self.read!r}; it must be a function (task, simulation) that returns "
-                "the value"
-            )
         if self.sensor:
             object.__setattr__(self, "felt", True)
             if self.size != 3 or not 0.0 < self.sensor < math.inf:
@@ -124,13 +102,6 @@ class Channel:
                 )
         elif self.low is None or self.high is None:
             raise ValueError(f"channel {self.name!r} has no bounds: give low and high, finite numbers or functions")
-        if not (self.low is None or self.high is None or callable(self.low) or callable(self.high)):
-            low, high = np.asarray(self.low, dtype=np.float64), np.asarray(self.high, dtype=np.float64)
-            if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
-                raise ValueError(
-                    f"channel {self.name!r}: bounds are {self.low!r} and {self.high!r}; low must be below high and "
-                    "both finite: widen them"
-                )
 
     @property
     def scale_shown(self) -> str:
@@ -186,45 +157,8 @@ class Reward:
     value: Callable[[Any, Any], float] | None = None
 
     def __post_init__(self) -> None:
-        _check_part("reward", self)
-        if not math.isfinite(self.weight):
-            raise ValueError(f"reward {self.name!r}: weight is {self.weight!r}; it must be a finite number")
-        if self.per not in PERIODS:
-            raise ValueError(f"reward {self.name!r}: per is {self.per!r}; it must be one of {', '.join(PERIODS)}")
         if self.per == "change" and self.value is None:
             raise ValueError(f"reward {self.name!r} pays a change, but has no value that could: give `value`")
-        if self.per in ("success", "failure") and self.value is not None:
-            raise ValueError(f"reward {self.name!r} pays once at the end of an episode: leave `value` out")
-
-
-def check_declared(owner: str, what: str, parts: Sequence[Any], kind: type) -> None:
-    """Refuse a declaration that is empty, holds anything but `kind`, or holds a name twice.
-
-    Raises:
-        TypeError: an entry of another type (says which).
-        ValueError: no entry, or two of one name.
-    """
-    if not parts:
-        raise ValueError(f"{owner} declares no {what}: give it `{what} = ({kind.__name__}(...), ...)`")
-    for place, part in enumerate(parts):
-        if not isinstance(part, kind):
-            raise TypeError(f"{owner}.{what}[{place}] is {part!r}; every entry must be a {kind.__name__}")
-    names = [part.name for part in parts]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{owner}.{what} has two entries called {name!r}; give each its own name")
-
-
-def _check_part(what: str, part: Any, size: object = 1) -> None:
-    """Check what commands, channels and rewards have in common."""
-    if not isinstance(part.name, str) or not part.name.isidentifier():
-        raise ValueError(f"{what} name {part.name!r}: it must be a Python identifier such as 'contact_force'")
-    if not callable(size) and (isinstance(size, bool) or not isinstance(size, int) or size <= 0):
-        raise ValueError(
-            f"{what} {part.name!r}: size is {size!r}; it must be a whole number above 0 or a function of the task"
-        )
-    if not isinstance(part.meaning, str) or not part.meaning.strip():
-        raise ValueError(f"{what} {part.name!r} has no meaning: say in a few words what it is, for the documentation")
 
 
 # ---- tables -------------------------------------------------------------------------------------------------------

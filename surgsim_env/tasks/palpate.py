@@ -279,9 +279,7 @@ class PalpateTask(Task):
         if frame not in FRAMES:
             known = ", ".join(FRAMES)
             raise ValueError(f"frame {frame!r} is unknown{nearest(frame, list(FRAMES))}; the frames are {known}")
-        if episode_steps is not None and (
-            isinstance(episode_steps, bool) or not isinstance(episode_steps, int) or episode_steps < 1
-        ):
+        if episode_steps is not None and episode_steps < 1:
             raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
         super().__init__(anatomy, instrument)
         self.charted = charted_face(anatomy)

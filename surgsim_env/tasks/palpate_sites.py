@@ -231,8 +231,7 @@ class PalpateSitesTask(Task):
     ) -> None:
         """Palpate an anatomy; a press is simulated or looked up, everything else is computed here.
 
-        An episode: `reset` (or `begin_episode` with an organ that was drawn elsewhere); for each press `begin`, `site`,
-        `take` with the result of the press, `observe`, `judge`.
+        An episode: `reset`; for each press `begin`, `site`, `take` with the result of the press, `observe`, `judge`.
 
         Attributes that agents and scores may read: `estimator` (the benchmark's common estimator, on the lengths of
         `charted.chart`), `budget`, `step_count`, `felt` (record of the presses), `estimate`, `estimated` (where it is
@@ -255,7 +254,7 @@ class PalpateSitesTask(Task):
         self.level, self.memory, self.track_motion = level, memory, track_motion
         # What member maps are made from, of a family: its template with the probe and without motion.
         self.still: Anatomy | None = None
-        if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 1):
+        if budget is not None and budget < 1:
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
         self.given_budget = budget
         self.reading = ForceReading(scene.sensor)
@@ -321,21 +320,15 @@ class PalpateSitesTask(Task):
     def reset(self, rng: np.random.Generator) -> Start:
         """Draw the organ and the sensor's bias; the tip waits above the middle of the chart."""
         assert self.level is not None
-        drawn = self.level.draw(self.anatomy, rng)
-        self.begin_episode(drawn, rng)
-        middle, scene = self.charted.site(np.zeros(2)), self.anatomy.scene
-        gap = scene.instrument.tip_radius + scene.palpation.clearance
-        return Start(drawn.compiled(self.anatomy), middle.point + middle.normal * gap)
-
-    def begin_episode(self, drawn: DrawnOrgan, rng: np.random.Generator, truth: FloatArray | None = None) -> None:
-        """Begin with an organ that was drawn; `truth` (n_lesion, 3) [m] is `drawn.places` where that is known."""
-        self.drawn = drawn
-        self.truth = drawn.places(self.anatomy) if truth is None else truth
+        drawn = self.drawn = self.level.draw(self.anatomy, rng)
+        self.truth = drawn.places(self.anatomy)
         self.reading.reset(rng)
-        assert self.level is not None
         if self.level.map_error:
             self.felt.map_shift = rng.normal(0.0, self.level.map_error, 2)
         self._clear()
+        middle, scene = self.charted.site(np.zeros(2)), self.anatomy.scene
+        gap = scene.instrument.tip_radius + scene.palpation.clearance
+        return Start(drawn.compiled(self.anatomy), middle.point + middle.normal * gap)
 
     def command(self, action: FloatArray, instrument: Instrument) -> None:
         """Nothing: a press commands the instrument itself."""

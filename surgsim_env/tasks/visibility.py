@@ -45,13 +45,13 @@ class Disc:
         across, _ = tangent_axes(self.normal)
         return np.stack([across, np.cross(self.normal, across), self.normal], axis=1)
 
-    def points(self, count: int = POINT_COUNT) -> FloatArray:
-        """Points spread evenly over the disc as a sunflower's seeds are [m], shape (count, 3).
+    def points(self) -> FloatArray:
+        """Points spread evenly over the disc as a sunflower's seeds are [m], shape (POINT_COUNT, 3).
 
         Each stands for as much of the disc's area, not of its picture, in which what is nearer is larger.
         """
-        index = np.arange(count)
-        distance = self.radius * np.sqrt((index + 0.5) / count)
+        index = np.arange(POINT_COUNT)
+        distance = self.radius * np.sqrt((index + 0.5) / POINT_COUNT)
         angle = index * GOLDEN_ANGLE
         level = np.stack([distance * cos(angle), distance * sin(angle)])
         return self.centre + matmul(self.rotation[:, :2], level).T
@@ -89,9 +89,6 @@ def visible(
 
     Returns:
         For each point whether nothing stands between it and the eye, shape (n,).
-
-    Raises:
-        ValueError: the eye stands in the middle of the points.
     """
     hidden, cone = _hidden_by(eye, points, node_position, triangles)
     hide_behind_shapes(
@@ -102,7 +99,7 @@ def visible(
 
 
 def uncovered(eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray) -> NDArray[np.bool_]:
-    """Which points are seen from an eye past triangles alone; arguments, result and errors as those of `visible`."""
+    """Which points are seen from an eye past triangles alone; arguments and result as those of `visible`."""
     return _hidden_by(eye, points, node_position, triangles)[0] == 0
 
 
@@ -113,9 +110,7 @@ def _hidden_by(
     rays = points - eye
     middle = rays.mean(axis=0)
     distances = norm(rays, axis=1)
-    cosine = float((matmul(rays, middle) / (distances * norm(middle))).min()) if distances.all() else -1.0
-    if not cosine > 0.0:
-        raise ValueError(f"the eye at {eye} m stands among the points that it looks at; move it away from them")
+    cosine = float((matmul(rays, middle) / (distances * norm(middle))).min())
     axis, sine = middle / norm(middle), math.sqrt(max(1.0 - cosine * cosine, 0.0))
     hidden = np.zeros(len(points), dtype=np.uint8)
     cone = (np.asarray(eye, dtype=np.float64), points, axis, cosine, sine, float(distances.max()))

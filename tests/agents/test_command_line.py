@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
 # Names that packages of the extras are imported by.
 PACKAGES = {
-    *("cma", "minari", "moviepy", "msgspec", "pettingzoo", "ray", "safetensors", "sklearn"),
+    *("cma", "minari", "moviepy", "msgspec", "ray", "safetensors", "sklearn"),
     *("stable_baselines3", "torch", "tqdm", "viser", "websockets"),
 }
 # Of ours, what imports them; imported anew here.
@@ -104,9 +104,9 @@ def test_a_command_names_the_missing_extra(without_extras, arguments: list[str],
 
 
 def test_public_names_that_need_an_extra_name_it(without_extras):
-    for name, extra in (("VectorEnvForStableBaselines", "agents"), ("BimanualRetractParallelEnv", "pettingzoo")):
-        with pytest.raises(ImportError, match=rf"surgsim_env\.{name} needs \w+: pip install 'surgsim\[{extra}\]'"):
-            getattr(surgsim_env, name)
+    name = "VectorEnvForStableBaselines"
+    with pytest.raises(ImportError, match=rf"surgsim_env\.{name} needs \w+: pip install 'surgsim\[agents\]'"):
+        getattr(surgsim_env, name)
 
 
 def test_wrong_input_ends_a_script_in_one_line_and_is_raised_in_a_module(capsys):

@@ -1,4 +1,4 @@
-"""`surgsim bench` as a user meets it, on the smallest of everything: lines, report, absent peers, exit status."""
+"""`surgsim bench` as a user meets it, on the smallest of everything: report, absent peers, exit status."""
 
 import re
 
@@ -7,7 +7,6 @@ import pytest
 from surgsim_env.bench import measurement as effort
 from surgsim_env.bench import peers, side_by_side, start
 from surgsim_env.bench.measurement import Effort
-from surgsim_env.bench.report import AbsentError
 from surgsim_env.cli.main import main
 
 TINY = Effort(
@@ -29,16 +28,12 @@ def test_bench(tmp_path, monkeypatch, capsys):
     # Starts from an empty cache take half a minute.
     monkeypatch.setattr(start, "printed_number", lambda code, environment=None: 1.5)
     assert main(["bench", "--quick", "--out", str(tmp_path / "deep")]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1].startswith("written: ")
-    for line in lines[:-1]:
-        assert re.fullmatch(r"\S+ (-?[\d.e+-]+|nan|absent) \S+( \(.*\))?", line), line
-    for name in ("substep/189_nodes/single", "substep/exponent", "haptic_step/bovine_liver_block/p99",
-                 "control_steps/single/1_env", "control_steps/processes/2_envs", "side_by_side/surgsim/force",
-                 "training/Palpate,_phantom_small,_memory/stepping,_wall", "training/Retract,_pictures/stepping,_wall",
-                 "start/start/warm 1.5 s"):  # fmt: skip
-        assert any(line.startswith(name) for line in lines), name
+    assert capsys.readouterr().out.splitlines()[-1].startswith("written: ")
     report = (tmp_path / "deep" / "benchmarks.md").read_text(encoding="utf-8")
+    for heading in ("Substep cost", "Haptic step", "Control steps a second", "Beside MuJoCo flex", "Start and memory"):
+        assert f"## {heading}" in report
+    for case in ("189 nodes", "exponent", "bovine_liver_block", "single", "processes", "surgsim", "Retract, pictures"):
+        assert f"\n| {case} |" in report, case
     for name in ("Newton explicit", "Newton vbd"):
         assert re.search(rf"\| {name} \| absent \|.*not installed", report)
     assert "trilinear 1x1x1" in report and side_by_side.LIMITS.strip() in report
@@ -50,7 +45,5 @@ def test_no_folder_can_be_made_of_a_file(tmp_path, capsys):
     assert "cannot be written" in capsys.readouterr().err
 
 
-def test_a_fresh_interpreter_prints_a_number_or_is_absent():
+def test_a_fresh_interpreter_prints_a_number():
     assert start.printed_number("import os; print('noise'); print(os.environ['MARK'])", {"MARK": "2.5"}) == 2.5
-    with pytest.raises(AbsentError, match="status 1"):
-        start.printed_number("raise SystemExit('no')")

@@ -1,4 +1,4 @@
-"""Figures as lines and tables: names without blanks, and what is absent with its reason."""
+"""Figures as tables, and what is absent with its reason."""
 
 from surgsim_env.bench.report import Figure, Section, absent, describe, version
 
@@ -13,14 +13,6 @@ SECTION = Section(
     ],
     "A closing.",
 )
-
-
-def test_lines():
-    assert SECTION.lines() == [
-        "press/one_peer/wall 12.35 s/s",
-        "press/one_peer/force 0.25 N",
-        "press/another/wall absent s/s (not installed)",
-    ]
 
 
 def test_table():

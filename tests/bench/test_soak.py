@@ -1,7 +1,6 @@
 """The soak finds what it watches for, and a run of it repeats."""
 
 import platform
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,8 +98,8 @@ def test_memory_is_compared_once_kinds_repeat():
     """Runs of one kind with each other: kinds hold different amounts."""
     count, kinds = 3 * soak.KINDS, soak.KINDS
     memory = {number: 1e9 * (number % kinds) + 1e6 * max(number - kinds, 0) for number in range(0, count, 2)}
-    assert soak.Worker(None, None, memory=memory).growth() == pytest.approx(1e6 * kinds)
-    assert soak.Worker(None, None, memory=dict.fromkeys(range(2 * kinds + 4), 1e6)).growth() is None
+    assert soak.growth(memory, 2) == pytest.approx(1e6 * kinds)
+    assert soak.growth(dict.fromkeys(range(2 * kinds + 4), 1e6), 2) is None
 
 
 def freed(blocks):
@@ -120,32 +119,3 @@ def test_memory_held_is_without_what_malloc_keeps():
     assert kept > 80e6 and soak.memory_held() - before < 5e6
     held = np.ones(5_000_000)
     assert soak.memory_held() - before == pytest.approx(held.nbytes + last.nbytes, abs=5e6)
-
-
-class Sent(list):
-    """A pipe that keeps what is sent through it."""
-
-    send = list.append
-
-
-@needs_glibc
-@pytest.mark.parametrize("leaked", [0, 4_000_000])
-def test_a_leak_is_told_from_what_malloc_keeps(monkeypatch, leaked):
-    leak, last = [], []
-    monkeypatch.setattr(soak, "time", SimpleNamespace(time=lambda: len(leak)))
-
-    def leaky(run):
-        leak.append(np.ones(leaked // 8))
-        # More is made and freed in later runs, as by kinds that alternate.
-        last[:] = [freed(50 * (run.number - soak.KINDS))]
-        return soak.Outcome()
-
-    monkeypatch.setattr(soak, "play", leaky)
-    pipe = Sent()
-    soak.work(soak.Soak(seed=0, processes=1, deadline=12, quick=True), soak.KINDS + 1, pipe)
-    outcomes = pipe[1:-1:2]
-    worker = soak.Worker(
-        None, None, memory={soak.KINDS * (1 + n // 6) + n % 6: one.memory for n, one in enumerate(outcomes)}
-    )
-    assert len(outcomes) == 12 and max(one.resident - one.memory for one in outcomes) > 10e6
-    assert worker.growth() == pytest.approx(6 * leaked, abs=3e6)

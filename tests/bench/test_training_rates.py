@@ -18,11 +18,12 @@ def test_rates_are_medians_and_what_cannot_run_says_why(monkeypatch):
 
     monkeypatch.setattr(training, "step", step)
     monkeypatch.setattr(training, "learn", learn)
-    lines = training.measure(QUICK).lines()
-    assert "training/Palpate,_phantom_small,_memory/stepping,_wall 300 1/s" in lines
-    assert "training/Palpate,_phantom_small,_memory/stepping,_processor 60 1/s" in lines
-    assert "training/Retract,_pictures/stepping,_wall absent 1/s (no OpenGL here)" in lines
-    assert sum("PPO,_wall absent 1/s (stable-baselines3 cannot be imported)" in line for line in lines) == 3
+    figures = {(one.case, one.quantity): one for one in training.measure(QUICK).figures}
+    assert figures["Palpate, phantom_small, memory", "stepping, wall"].value == 300.0
+    assert figures["Palpate, phantom_small, memory", "stepping, processor"].value == 60.0
+    absent = figures["Retract, pictures", "stepping, wall"]
+    assert absent.value is None and absent.note == "no OpenGL here"
+    assert sum(one.note == "stable-baselines3 cannot be imported" for one in figures.values()) == 3
 
 
 def test_a_round_ends_where_the_next_begins(monkeypatch):

@@ -1,7 +1,6 @@
 """A state is restored to the bit, or refused and nothing changes."""
 
 import io
-import json
 import re
 
 import gymnasium as gym
@@ -44,11 +43,6 @@ def without(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
     return {key: value for key, value in arrays.items() if key != name}
 
 
-def other_kept(task: np.ndarray) -> np.ndarray:
-    table = json.loads(str(task))
-    return np.array(json.dumps({**table, "kept": {"more": 1}}))
-
-
 BREAKS = [
     (lambda arrays: without(arrays, "random"), "entry 'random' is missing"),
     (lambda arrays: without(arrays, "organ_node_force"), "entry 'organ_node_force' is missing"),
@@ -59,7 +53,6 @@ BREAKS = [
         lambda arrays: {**arrays, "organ_node_position": arrays["organ_node_position"][:10]},
         r"'organ_node_position' has shape \(10, 3\); it must be \(\d+, 3\)",
     ),
-    (lambda arrays: {**arrays, "task": other_kept(arrays["task"])}, "the state keeps more; the task keeps declare"),
     (
         lambda arrays: {**arrays, "made_by": np.array(f"{arrays['made_by']}1")},
         r"saved by .*version 11, this is .*version 1: use the same scene",

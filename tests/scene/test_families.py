@@ -156,9 +156,8 @@ def test_splits_and_members_that_are_none():
         family_of(plain, "test")
     with pytest.raises(ValueError, match="3"):
         family.member(3)
-    for wrong in ("test 0", "train -1", "train 1.0"):
-        with pytest.raises(ValueError, match=wrong):
-            family.named(wrong)
+    with pytest.raises(ValueError, match="test 0"):
+        family.named("test 0")
     assert family.named("train 2") is family.member(2)
 
 
@@ -169,7 +168,6 @@ def test_splits_and_members_that_are_none():
         ({"aspect": (1.1, 1.0)}, "aspect = .*1.1"),
         ({"thickness": (1.0, float("nan"))}, "thickness"),
         ({"curvature": -1.0}, "curvature is -1"),
-        ({"quality_share": 1.1}, "quality_share is 1.1"),
         ({"test": 0}, "test is 0"),
     ],
 )

@@ -37,13 +37,3 @@ def test_graded_liver_has_the_palpable_face_of_the_uniform_one():
     assert len(others) == pytest.approx(len(sites), rel=0.03)
     offset = [np.linalg.norm(graded.face.project(site)[0] - site) for site in sites]
     assert np.median(offset) < 1e-4 and max(offset) < 1e-3
-
-
-def test_graded_block_scene():
-    uniform = load_anatomy(make_scene("phantom"))
-    graded = load_anatomy(changed_scene("phantom", "block", coarsening=2, fine_depth=0.01))
-    assert graded.mesh.node_count < 0.6 * uniform.mesh.node_count
-    np.testing.assert_array_equal(
-        np.unique(graded.face.points[graded.face.triangles].reshape(-1, 3).round(12), axis=0),
-        np.unique(uniform.face.points[uniform.face.triangles].reshape(-1, 3).round(12), axis=0),
-    )

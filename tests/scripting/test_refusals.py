@@ -38,9 +38,7 @@ NUMBERS = [
     ("Declare", "timeout"),
     ("Control", "timeout"),
 ]
-NOT_ABOVE_ZERO = st.one_of(
-    st.floats(max_value=0.0), st.sampled_from([math.nan, math.inf, None, "fast", True, (0.1,), 1j]), st.integers(-9, 0)
-)
+NOT_ABOVE_ZERO = st.one_of(st.floats(max_value=0.0), st.sampled_from([math.nan, math.inf]), st.integers(-9, 0))
 
 
 @given(st.sampled_from(NUMBERS), NOT_ABOVE_ZERO)
@@ -54,24 +52,12 @@ def test_numbers_that_are_not_above_zero(place, value):
 POINTS = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)
 
 
-@given(st.one_of(st.lists(st.floats(-1.0, 1.0)).filter(lambda values: len(values) != 3), st.text(), st.none()))
-def test_other_than_three_numbers_are_no_point(value):
-    with pytest.raises(ValueError, match="MoveTo: point"):
-        MoveTo(value)
-
-
 @given(POINTS.filter(lambda values: np.linalg.norm(values) > 1e-3))
 def test_directions_are_brought_to_length_one(values):
     for step in (PressUntil(0.2, 0.004, direction=values), Lift(0.01, direction=values)):
         assert np.linalg.norm(step.direction) == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(np.cross(step.direction, values), 0.0, atol=1e-12)
         assert np.dot(step.direction, values) > 0.0
-
-
-@pytest.mark.parametrize(("step", "field"), [("WaitUntil", "predicate"), ("Control", "until")])
-def test_what_is_called_must_be_callable(step, field):
-    with pytest.raises(TypeError, match=rf"{step}: {field} is 3\.0"):
-        MADE[step](**{field: 3.0})
 
 
 @pytest.fixture(scope="module")

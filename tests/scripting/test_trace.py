@@ -36,8 +36,6 @@ def test_cuts_are_the_steps_and_together_the_whole():
         ValueError, match="no step 'press' was run; the steps are 'PressUntil', 'a, hold', 'Lift', 'Hold'"
     ):
         trace.between("press")
-    with pytest.raises(ValueError, match="step 'PressUntil' comes before 'Lift': swap them"):
-        trace.between("Lift", "PressUntil")
 
 
 def test_depth_starts_anew_with_each_contact():
@@ -88,8 +86,6 @@ def test_tables_read_back_to_the_bit_and_repeat_to_the_byte(tmp_path):
     assert column(table, "force_peak").max() == max(info["force_peak"] for info in trace.infos)
     again = trace.to_csv(tmp_path / "again.csv")
     assert [path.read_bytes() for path in again] == [haptic.read_bytes(), control.read_bytes()]
-    with pytest.raises(ValueError, match=r'does not end in "\.csv"'):
-        trace.to_csv(tmp_path / "run.txt")
 
 
 def made_up(wrench, name):

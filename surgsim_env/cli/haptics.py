@@ -147,18 +147,7 @@ def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | Trajec
 
 
 def _dynamics(command: Haptics) -> DeviceDynamics | None:
-    """Of a device that pushes back; its options are checked whether or not a device uses them."""
-    for option, value, or_zero in (
-        ("damping", command.device_damping, False),
-        ("mass", command.device_mass, False),
-        ("delay", command.device_delay, True),
-    ):
-        if value is not None and not (math.isfinite(value) and (value > 0.0 or (or_zero and value == 0.0))):
-            without = "; leave it away for a device without force" if option == "damping" else ""
-            raise ValueError(
-                f"--device-{option} is {value:g}; it must be finite and {'not negative' if or_zero else 'above 0'}"
-                f"{without}"
-            )
+    """Of a device that pushes back."""
     if command.device_damping is None:
         return None
     if command.trajectory is not None:

@@ -11,17 +11,14 @@ class DevicePose(NamedTuple):
     """Pose of a device's handle.
 
     Fields:
-        position: in the device's own frame [m], shape (3,)
+        position: along the scene's axes [m], shape (3,)
         time: of reading, on a monotonic clock [s]
         buttons: one bit each, the first is 1
-        rotation: unit quaternion (w, x, y, z) from the handle's axes to the device's frame; None where not measured.
-            Not used in this version: a device moves a tip and does not turn it.
     """
 
     position: FloatArray
     time: float
     buttons: int = 0
-    rotation: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,7 @@ class HapticDevice(Protocol):
         ...
 
     def write(self, force: FloatArray) -> None:
-        """Push the hand with a force in the device's frame [N], shape (3,), until the next one."""
+        """Push the hand with a force along the scene's axes [N], shape (3,), until the next one."""
         ...
 
 

@@ -167,13 +167,7 @@ class Session:
             self._requests += 1
 
     def move_to(self, arm: int, target: FloatArray) -> None:
-        """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm.
-
-        Raises:
-            ValueError: the target is not finite.
-        """
-        if not np.isfinite(target).all():
-            raise ValueError(f"the target of a hand is {target}; it must be finite")
+        """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm."""
         with self._lock:
             self._targets[arm] = np.clip(target, self.instrument.lower - 0.01, self.instrument.upper + 0.01)
 
@@ -208,7 +202,7 @@ class Session:
 
     @property
     def breath_held(self) -> bool:
-        """Whether the page holds the breath; in a replay the recording does, or does not."""
+        """Whether the page holds the breath."""
         return bool(self._buttons[0] & BREATH_BUTTON)
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
-from surgsim_env.haptics.trajectory import ROWS_LARGEST, TIP, read_motion
+from surgsim_env.haptics.trajectory import TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.scripting.observations import make_read_only
 from surgsim_env.tasks.task import Task
@@ -279,15 +279,9 @@ def _recorded_path(path: Path, mark: str) -> tuple[FloatArray, FloatArray]:
     """Times from 0 [s] (n,) and places [m] (n, 3) of a tip that was recorded, else of a hand without pauses."""
     with path.open(encoding="utf-8", errors="replace") as file:
         of_tip = f"{TIP}x{mark}" in file.readline().strip().split(",")
-    motion = read_motion(path, (mark,), rows_largest=ROWS_LARGEST, of_tip=of_tip)
-    known = ~np.isnan(motion.position[:, 0]).all(axis=1) | (not motion.recorded)
-    time, places = motion.time[known], motion.position[known, 0]
-    wrong = np.flatnonzero(~(np.isfinite(time) & np.isfinite(places).all(axis=1)))
-    if len(wrong):
-        raise ValueError(f"{path.name}, row {wrong[0]}: a number is not finite; leave the row out")
-    if (np.diff(time) <= 0.0).any():
-        row = int(np.flatnonzero(np.diff(time) <= 0.0)[0]) + 1
-        raise ValueError(f"{path.name}, row {row}: time {time[row]:g} s is not after that of the row before")
+    motion = read_motion(path, mark, of_tip=of_tip)
+    known = np.isfinite(motion.position).all(axis=1)
+    time, places = motion.time[known], motion.position[known]
     return time - time[0], places
 
 

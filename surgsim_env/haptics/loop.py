@@ -28,7 +28,6 @@ class TipTelemetry(NamedTuple):
     """One device and its tip in one haptic step.
 
     Fields:
-        pose: the device's last valid pose; None before the first
         fresh: whether it was read in this step
         target: the coupling's target in the scene [m]                                        (3,)
         tip: position of the tip at the start of the step [m]                                 (3,)
@@ -48,7 +47,6 @@ class TipTelemetry(NamedTuple):
         energy: net work of the hand on the device since the reset [J]
     """
 
-    pose: DevicePose | None
     fresh: bool
     target: FloatArray
     tip: FloatArray
@@ -312,7 +310,6 @@ class HeldTip:
         """The record of the step; `contact_force` [N], (3,), is the tissue's in it."""
         tip = self.drive.tool.tip_position
         return TipTelemetry(
-            pose=self._pose,
             fresh=self._fresh,
             target=self._follower.place,
             tip=tip,

@@ -51,20 +51,6 @@ class PosePacket(NamedTuple):
     buttons: int = 0
 
 
-class ForcePacket(NamedTuple):
-    """A force as it travels: sequence and time of the pose that it answers, and the force [N], (3,)."""
-
-    sequence: int
-    time: float
-    force: FloatArray
-
-
-def pack_pose(pose: PosePacket) -> bytes:
-    """The 44 bytes of a pose."""
-    header = (MAGIC, VERSION, KIND_POSE, pose.buttons, pose.sequence, pose.time)
-    return PACKET.pack(*header, *pose.position.tolist())
-
-
 def unpack_pose(data: bytes) -> PosePacket | None:
     """A pose of exactly 44 well-formed bytes; None for anything else."""
     if len(data) != PACKET.size:
@@ -76,21 +62,6 @@ def unpack_pose(data: bytes) -> PosePacket | None:
     if not all(abs(value) <= POSITION_LARGEST for value in (x, y, z)):
         return None
     return PosePacket(sequence, time, np.array((x, y, z)), buttons)
-
-
-def pack_force(force: ForcePacket) -> bytes:
-    """The 44 bytes of a force."""
-    return PACKET.pack(MAGIC, VERSION, KIND_FORCE, 0, force.sequence, force.time, *force.force.tolist())
-
-
-def unpack_force(data: bytes) -> ForcePacket | None:
-    """A force of exactly 44 well-formed bytes; None for anything else."""
-    if len(data) != PACKET.size:
-        return None
-    magic, version, kind, _, sequence, time, *force = PACKET.unpack(data)
-    if magic != MAGIC or version != VERSION or kind != KIND_FORCE or not all(map(math.isfinite, (time, *force))):
-        return None
-    return ForcePacket(sequence, time, np.array(force))
 
 
 def newer(sequence: int, last: int) -> bool:
@@ -196,7 +167,7 @@ class UdpDevice:
         if not self._unanswered or self._last is None or self._peer is None:
             return
         self._unanswered = False
-        packet = pack_force(ForcePacket(self._last.sequence, self._last.time, force))
+        packet = PACKET.pack(MAGIC, VERSION, KIND_FORCE, 0, self._last.sequence, self._last.time, *force.tolist())
         try:
             self._socket.sendto(packet, self._peer)
         except OSError:

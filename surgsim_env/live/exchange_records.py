@@ -175,7 +175,7 @@ def trace_type(arm_count: int) -> np.dtype:
             ("peak", "f8", (arm_count,)),
         ]
     )
-    return np.dtype([("organ", "i8"), ("count", "i8"), ("row", row, (TRACE_LENGTH,))])
+    return np.dtype([("count", "i8"), ("row", row, (TRACE_LENGTH,))])
 
 
 def recording_type(arm_count: int) -> np.dtype:

@@ -230,7 +230,7 @@ class Physics:
         for hand, held in zip(self._hands, self._loop.held, strict=True):
             hand.restart(held.drive.tool.tip_position)
         with self._exchange.trace.writing() as trace:
-            trace["organ"], trace["count"] = self._organ_number, 0
+            trace["count"] = 0
         self._peak[:] = 0.0
         untouched = tuple(held.telemetry(np.zeros(3)) for held in self._loop.held)
         self._last = HapticTelemetry(self._simulation.time, "", untouched)

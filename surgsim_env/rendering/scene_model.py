@@ -148,7 +148,7 @@ def build_scene(
 ) -> SceneModel:
     """The scene of an anatomy and an instrument's model, with room for the meshes that the options need."""
     spec = empty_scene(options.width, options.height, BACKGROUND_COLOUR, samples=4 if options.smooth_edges else 0)
-    light = add_lights(spec, anatomy.downward, shadows=options.shadows)
+    light = add_lights(spec, anatomy.downward)
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
@@ -237,13 +237,13 @@ def _room(
         # A tet is cut in a quadrangle at most; its triangles are split, and a lesion's outline may divide each of them.
         small = 2 * SECTION_SPLITS**2 * most_tets_cut(anatomy.mesh, cut_direction(anatomy))
         room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
-    elif not (options.shadows or options.show_lesion or anatomy.scene.supports):
+    elif not (options.show_lesion or anatomy.scene.supports):
         # An organ on supports does not lie on the drape and casts no shadow on it.
         room["shadow"] = (anatomy.mesh.node_count, len(anatomy.mesh.boundary_triangles))
     return room
 
 
-def add_lights(spec: mujoco.MjSpec, down: FloatArray, *, shadows: bool = False) -> FloatArray:
+def add_lights(spec: mujoco.MjSpec, down: FloatArray) -> FloatArray:
     """A lamp above the surgeon's left shoulder, a faint one from behind, one at the camera; the lamp's direction."""
     up = -down
     across, along = tangent_axes(down)
@@ -252,7 +252,7 @@ def add_lights(spec: mujoco.MjSpec, down: FloatArray, *, shadows: bool = False) 
         light = spec.worldbody.add_light(name=name, dir=towards / np.linalg.norm(towards))
         light.pos = -0.8 * np.asarray(light.dir)
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-        light.castshadow = shadows and name == "lamp"
+        light.castshadow = False
         light.diffuse, light.specular, light.ambient = [strength] * 3, [strength] * 3, [0.0] * 3
     head = spec.visual.headlight
     head.ambient, head.diffuse, head.specular = [0.30] * 3, [0.36] * 3, [0.10] * 3

@@ -4,9 +4,9 @@ import numpy as np
 
 from surgsim_env.haptics.loop import HapticLoop, TipTelemetry
 from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.udp import PACKET, PACKETS_PER_READ, unpack_force
+from surgsim_env.haptics.udp import PACKET, PACKETS_PER_READ
 from tests.haptics.bench_hand import touching_simulation
-from tests.haptics.udp_link import Sender, arrived, drained
+from tests.haptics.udp_link import Sender, arrived, drained, force_of
 
 
 def test_pose_is_read_and_answered_once(device, sender):
@@ -15,9 +15,7 @@ def test_pose_is_read_and_answered_once(device, sender):
     assert pose is not None and pose.buttons == 2 and pose.time == 100.0
     np.testing.assert_array_equal(pose.position, (0.01, 0.02, 0.03))
     device.write(np.array((0.5, -0.5, 1.0)))
-    answer = unpack_force(sender.answer())
-    assert answer is not None and answer.sequence == 3 and answer.time == 1.5
-    np.testing.assert_array_equal(answer.force, (0.5, -0.5, 1.0))
+    assert force_of(sender.answer()) == (3, 1.5, (0.5, -0.5, 1.0))
     # Nothing new was read: no second answer.
     assert device.read() is None
     device.write(np.ones(3))

@@ -62,7 +62,7 @@ def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, ha
         damping: B of the coupling [N s/m].
         haptic_step: T [s].
     """
-    lag, mine, other = device.lag(haptic_step), device.damping, tip.damping
+    lag, mine, other = device.delay, device.damping, tip.damping
     # (b_d - S - D)(b_t - S) - (S + D/2)^2 = b_d b_t - S (b_d + b_t) - D b_t - D^2 / 4, a quadratic in K.
     rest = mine * other - abs(damping) * (mine + other)
     if rest <= 0.0:
@@ -126,6 +126,6 @@ def check_coupling(
             f"a coupling of {coupling.stiffness:g} N/m at the device's handle is stiffer than {limit:.4g} N/m, "
             f"the passivity limit with device damping {device.damping:g} N s/m, tip damping "
             f"{tip.damping:g} N s/m, coupling damping {coupling.damping:g} N s/m, a haptic step of "
-            f"{haptic_step * 1e3:g} ms and a lag of {device.lag(haptic_step) * 1e3:g} ms: lower the stiffness or the "
+            f"{haptic_step * 1e3:g} ms and a lag of {device.delay * 1e3:g} ms: lower the stiffness or the "
             "coupling's damping, or use a device with more damping or less delay"
         )

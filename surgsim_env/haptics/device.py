@@ -28,8 +28,8 @@ class DeviceDynamics:
     Args:
         damping: viscous damping b of the device itself, without a hand [N s/m]; more of it allows a stiffer coupling.
         mass: apparent mass m at the handle [kg].
-        delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters.
-        pose_interval: time between two of its poses [s]; None: a pose each haptic step.
+        delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters, and
+            the interval of poses beyond a haptic step.
         force_largest: largest force that it can exert [N].
 
     Raises:
@@ -39,7 +39,6 @@ class DeviceDynamics:
     damping: float
     mass: float
     delay: float = 0.0
-    pose_interval: float | None = None
     force_largest: float = math.inf
 
     def __post_init__(self) -> None:
@@ -47,12 +46,6 @@ class DeviceDynamics:
         require_positive("device mass", self.mass, "kg")
         require_positive("device force_largest", self.force_largest, "N", finite=False)
         require_positive("device delay", self.delay, "s", or_zero=True)
-        if self.pose_interval is not None:
-            require_positive("device pose_interval", self.pose_interval, "s")
-
-    def lag(self, haptic_step: float) -> float:
-        """Delay beyond one haptic step [s]: the device's own, and that of less frequent poses."""
-        return self.delay + max(0.0, (self.pose_interval or haptic_step) - haptic_step)
 
 
 class HapticDevice(Protocol):

@@ -136,10 +136,8 @@ class Phase(IntEnum):
 
 
 def hand_type(arm_count: int) -> np.dtype:
-    """Page to physics: target of each arm [m], its buttons, a beat that counts up, the number of requests sent."""
-    return np.dtype(
-        [("target", "f8", (arm_count, 3)), ("buttons", "i8", (arm_count,)), ("beat", "i8"), ("requests", "i8")]
-    )
+    """Page to physics: target of each arm [m], its buttons, a beat that counts up."""
+    return np.dtype([("target", "f8", (arm_count, 3)), ("buttons", "i8", (arm_count,)), ("beat", "i8")])
 
 
 def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:

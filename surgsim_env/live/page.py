@@ -129,8 +129,8 @@ class Page:
         }
 
     def show_plain(self, on: bool) -> None:
-        """Turn shadows, reflections and the finest triangles off or on, in every tab."""
-        self._plain = self._organ.plain = on
+        """Turn shadows and reflections off or on, in every tab."""
+        self._plain = on
         self._surroundings.show_plain(on)
         self._panel.show_plain(on)
 

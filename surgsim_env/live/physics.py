@@ -44,8 +44,6 @@ from surgsim_env.scene.model import Scene
 
 # Steps between frames for the page, and between checks of the parent process and of requests.
 FRAME_STEPS, LOOK_STEPS = 16, 8
-# Requests handled per check; others wait for the next.
-REQUESTS_MOST = 4
 # Largest speeds at which a tip follows its hand, in general and on the way to the organ [m/s].
 SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
 # Initial distance of a tip on slides from the organ, and smallest distance of any contact shape [m].
@@ -156,8 +154,6 @@ class Physics:
         # The page counts recordings: one may begin and end between two of its looks.
         self._recording, self._recordings = False, 0
         self._peak = np.zeros(len(self._hands))
-        # Number of requests handled; earlier ones wait in the pipe.
-        self._asked = 0
         # The first step loads or compiles the kernels.
         self._last = self._loop.step()
         self._restart()
@@ -184,18 +180,12 @@ class Physics:
         """Handle requests; False to end."""
         if not parent_lives():
             return False
-        asked = int(self._exchange.hand.peek["requests"])
-        if asked == self._asked:
-            return True
         took_long = False
         try:
-            for _ in range(REQUESTS_MOST):
-                if not self._requests.poll():
-                    break
+            while self._requests.poll():
                 request = self._requests.recv()
                 if isinstance(request, End):
                     return False
-                self._asked += 1
                 self._handle(request)
                 took_long = took_long or isinstance(request, Change | Reset)
         except (EOFError, OSError):

@@ -79,7 +79,6 @@ class Session:
         self._motions: dict[int, tuple[FloatArray, float]] = {}
         self._clock = clock
         self._lock = threading.Lock()
-        self._requests = 0
         spawn = multiprocessing.get_context("spawn")
         self._pipe, child = spawn.Pipe()
         pace = pace or PaceSettings(period=self.scene.timing.haptic_step)
@@ -160,11 +159,9 @@ class Session:
         with self._lock:
             if isinstance(request, Change):
                 self.choice = request.choice
-            try:
+            # Where the physics is gone, `alive` says so.
+            with contextlib.suppress(OSError):
                 self._pipe.send(request)
-            except OSError:
-                return  # The physics is gone; `alive` says so.
-            self._requests += 1
 
     def move_to(self, arm: int, target: FloatArray) -> None:
         """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm."""
@@ -242,4 +239,3 @@ class Session:
         with self.exchange.hand.writing() as hand:
             hand["target"], hand["buttons"] = self._targets, self._buttons
             hand["beat"] += 1
-            hand["requests"] = self._requests

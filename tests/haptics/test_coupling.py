@@ -18,7 +18,7 @@ lags = st.floats(0.0, 0.01)
 
 def margin(stiffness, device, tip, damping):
     """Least eigenvalue of diag(b_d, b_t) - S (1 1; 1 1) - D (1 1/2; 1/2 0): what is left of the energy taken a step."""
-    shared, late = stiffness * DT / 2 + damping, stiffness * device.lag(DT)
+    shared, late = stiffness * DT / 2 + damping, stiffness * device.delay
     taken = np.diag([device.damping, tip.damping])
     given_back = shared * np.ones((2, 2)) + late * np.array([[1.0, 0.5], [0.5, 0.0]])
     return np.linalg.eigvalsh(taken - given_back)[0]
@@ -53,9 +53,9 @@ def test_rarer_poses_and_delay_cost_stiffness():
         stiffness_limit(device, TIP, 0.0, DT)
         for device in (
             DeviceDynamics(0.5, 0.05),
-            DeviceDynamics(0.5, 0.05, pose_interval=2e-3),
             DeviceDynamics(0.5, 0.05, delay=1e-3),
-            DeviceDynamics(0.5, 0.05, delay=1e-3, pose_interval=2e-3),
+            DeviceDynamics(0.5, 0.05, delay=1e-3),
+            DeviceDynamics(0.5, 0.05, delay=2e-3),
         )
     ]
     assert limits[0] == pytest.approx(800.0)  # (2 / T) b_d b_t / (b_d + b_t)

@@ -245,11 +245,6 @@ def new_exchange(arm_count: int, node_count: int, geom_count: int) -> Exchange:
     )
 
 
-def encoded(text: str) -> bytes:
-    """A text in UTF-8, cut to the TEXT_MOST bytes that a frame holds."""
-    return text.encode("utf-8")[:TEXT_MOST].decode("utf-8", "ignore").encode("utf-8")
-
-
 # ---- requests of the page, sent through a pipe ---------------------------------------------------------------------
 
 

@@ -35,7 +35,6 @@ from surgsim_env.live.exchange_records import (
     Record,
     Request,
     Reset,
-    encoded,
 )
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
 from surgsim_env.rendering.scene_model import shown_geoms
@@ -286,7 +285,7 @@ class Physics:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
             frame["recording"], frame["recordings"] = self._recording, self._recordings
             frame["breath_held"] = simulation.holds_breath
-            frame["time"], frame["said"] = simulation.time, encoded(self._said)
+            frame["time"], frame["said"] = simulation.time, self._said.encode()
             frame["added_mass"] = self._organ.added_mass
             for arm, tip in enumerate(told.tips):
                 frame["tip"][arm] = self._loop.held[arm].drive.tool.tip_position

@@ -76,13 +76,10 @@ class DrawnMesh:
         self._model = model
         self.mesh = model.mesh(name).id
         self.geom = model.geom(name).id
-        self._room = int(model.mesh_vertnum[self.mesh]), int(model.mesh_facenum[self.mesh])
-        self._face_count = self._room[1]
-        assert model.mesh_normalnum[self.mesh] == self._room[0]
+        self._face_count = int(model.mesh_facenum[self.mesh])
 
     def upload(self, shape: Shape, context: mujoco.MjrContext) -> None:
         """Replace the shape of the mesh; the geom's frame is the world's."""
-        assert len(shape.vertices) <= self._room[0] and len(shape.faces) <= self._room[1]
         model, mesh, count = self._model, self.mesh, len(shape.vertices)
         for array, address, values in (
             (model.mesh_vert, model.mesh_vertadr, shape.vertices),

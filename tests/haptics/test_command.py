@@ -100,7 +100,7 @@ def test_ctrl_c_keeps_the_steps_until_then_whole(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("surgsim_env.cli.haptics.Pacer", Interrupted)
     out = tmp_path / "out"
-    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == 130
+    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == 0
     assert [path.name for path in out.iterdir()] == ["telemetry.csv"]
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surgsim_env.haptics.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
-from surgsim_env.live.exchange_records import LiveError, RecordedSteps, SharedRecord, encoded
+from surgsim_env.live.exchange_records import LiveError, RecordedSteps, SharedRecord
 
 PAIR = np.dtype([("one", "f8", (500,)), ("other", "f8", (500,))])
 
@@ -147,7 +147,3 @@ def test_recorded_steps_have_an_end():
     assert recorded.full and recorded.steps["time"].tolist() == [0.0, 0.001, 0.002]
     recorded.clear()
     assert recorded.count == 0
-
-
-def test_words_are_cut_at_a_letter():
-    assert encoded("é" * 500).decode() == "é" * 120

@@ -172,11 +172,9 @@ def read_arm(path: Path) -> object:
 
 
 def csv_cases(folder: Path) -> Iterator[Files]:
-    from surgsim_env.haptics.trajectory import save_trajectory
-
     times = np.linspace(0.0, 0.3, 31)
-    places = np.stack([0.01 * np.sin(times), 0.01 * np.cos(times), -0.001 * times], axis=1)
-    save_trajectory(folder / "one.csv", times, places, [0, 1] * 15 + [0])
+    table = np.stack([times, 0.01 * np.sin(times), 0.01 * np.cos(times), -0.001 * times, np.arange(31) % 2], axis=1)
+    np.savetxt(folder / "one.csv", table, delimiter=",", header="time,x,y,z,buttons", comments="")
     yield {"one.csv": (folder / "one.csv").read_bytes()}
 
 

@@ -21,7 +21,6 @@ CASES = {
     "rgb_no_smooth_edges": {"smooth_edges": False},
     "rgb_show_lesion": {"show_lesion": True},
     "rgb_cut_away": {"cut_away": True},
-    "rgb_shadows": {"shadows": True},
 }
 
 

@@ -6,10 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import msdm_core
 from msdm_core import numba_cache
-from surgsim_env.rendering.gl import import_mujoco
 
 with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
-    import_mujoco()
     # Before anything else imports them: compiled code is cached where it was when it was decorated.
     from surgsim_env.coupling import haptic_kernels  # noqa: F401
     from surgsim_env.instruments import mujoco_kernels, tool_kernels  # noqa: F401

@@ -5,7 +5,7 @@ import gc
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,7 +100,8 @@ class Haptics:
             pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
             step, a_second = 0, round(1.0 / simulation.haptic_dt)
             count = None if self.seconds is None else round(self.seconds / simulation.haptic_dt)
-            try:
+            # Ctrl-C ends a run that has no end of its own.
+            with suppress(KeyboardInterrupt):
                 while count is None or step < count:
                     pacer.wait()
                     told = loop.step()
@@ -116,15 +117,14 @@ class Haptics:
                     pacer.done(simulation.haptic_dt)
                     if count is None and isinstance(device, TrajectoryDevice) and device.over:
                         break
-            finally:
-                kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
-                console.print(
-                    f"{kept.rate:.1f} haptic steps a second; late by {kept.late_p50 * 1e3:.2f} ms (half), "
-                    f"{kept.late_p99 * 1e3:.2f} ms (99 %), {kept.late_most * 1e3:.2f} ms (all); "
-                    f"{kept.skipped} steps given up"
-                )
-                if isinstance(device, UdpDevice):
-                    console.print(f"packets: {device.counts}")
+            kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
+            console.print(
+                f"{kept.rate:.1f} haptic steps a second; late by {kept.late_p50 * 1e3:.2f} ms (half), "
+                f"{kept.late_p99 * 1e3:.2f} ms (99 %), {kept.late_most * 1e3:.2f} ms (all); "
+                f"{kept.skipped} steps given up"
+            )
+            if isinstance(device, UdpDevice):
+                console.print(f"packets: {device.counts}")
         return 0
 
 
@@ -133,32 +133,14 @@ def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | Trajec
     """The device that the options choose, closed at the end."""
     dynamics = _dynamics(command)
     if command.trajectory is not None:
-        try:
-            device = TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
-        except OSError as error:
-            raise ValueError(
-                f"--trajectory {command.trajectory}: cannot be read ({error.strerror}); give a CSV file with columns "
-                "time, x, y, z"
-            ) from None
-        yield device
+        yield TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
         return
     with closing(UdpDevice(command.port, dynamics=dynamics)) as device:
         yield device
 
 
 def _dynamics(command: Haptics) -> DeviceDynamics | None:
-    """Of a device that pushes back; its options are checked whether or not a device uses them."""
-    for option, value, or_zero in (
-        ("damping", command.device_damping, False),
-        ("mass", command.device_mass, False),
-        ("delay", command.device_delay, True),
-    ):
-        if value is not None and not (math.isfinite(value) and (value > 0.0 or (or_zero and value == 0.0))):
-            without = "; leave it away for a device without force" if option == "damping" else ""
-            raise ValueError(
-                f"--device-{option} is {value:g}; it must be finite and {'not negative' if or_zero else 'above 0'}"
-                f"{without}"
-            )
+    """Of a device that pushes back."""
     if command.device_damping is None:
         return None
     if command.trajectory is not None:
@@ -171,26 +153,17 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
 
 @contextmanager
 def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
-    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing.
-
-    Ctrl-C is how a run ends that has no end of its own: what was written until then is kept.
-    """
+    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing."""
     if folder is None:
         yield lambda told: None
         return
-    stopped: KeyboardInterrupt | None = None
     with (
         output_folder(folder, [TELEMETRY_NAME]) as files,
         (files / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
-        try:
-            yield lambda told: writer.writerow(_row(told))
-        except KeyboardInterrupt as error:
-            stopped = error
-    if stopped is not None:
-        raise stopped
+        yield lambda told: writer.writerow(_row(told))
 
 
 def _row(told: HapticTelemetry) -> list[float | int]:

@@ -62,7 +62,7 @@ def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, ha
         damping: B of the coupling [N s/m].
         haptic_step: T [s].
     """
-    lag, mine, other = device.lag(haptic_step), device.damping, tip.damping
+    lag, mine, other = device.delay, device.damping, tip.damping
     # (b_d - S - D)(b_t - S) - (S + D/2)^2 = b_d b_t - S (b_d + b_t) - D b_t - D^2 / 4, a quadratic in K.
     rest = mine * other - abs(damping) * (mine + other)
     if rest <= 0.0:
@@ -73,9 +73,7 @@ def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, ha
     return 2.0 * rest / (slope + math.sqrt(slope * slope + 4.0 * bend * rest))
 
 
-def coupling_for(
-    device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float, scale: float = 1.0
-) -> VirtualCoupling:
+def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float) -> VirtualCoupling:
     """The default coupling for a device: 0.8 of its limit with a quarter of its damping; without a device 500 N/m.
 
     Without a device the damping is critical for the tip's mass, within the limit of the explicit step.
@@ -86,30 +84,28 @@ def coupling_for(
     if device is None:
         stiffness = min(STIFFNESS_FREE, 0.5 * tip.mass / haptic_step**2)
         return VirtualCoupling(stiffness, min(2.0 * math.sqrt(stiffness * tip.mass), 0.5 * tip.mass / haptic_step))
-    felt = TipDynamics(tip.mass * scale, tip.damping * scale)
-    damping = DAMPING_SHARE * min(device.damping, felt.damping)
+    damping = DAMPING_SHARE * min(device.damping, tip.damping)
     # The limit of the tip, as in `check_coupling`.
-    bearable = (2.0 * felt.mass - 2.0 * damping * haptic_step) / haptic_step**2
-    stiffness = STIFFNESS_SHARE * min(stiffness_limit(device, felt, damping, haptic_step), bearable)
+    bearable = (2.0 * tip.mass - 2.0 * damping * haptic_step) / haptic_step**2
+    stiffness = STIFFNESS_SHARE * min(stiffness_limit(device, tip, damping, haptic_step), bearable)
     if stiffness <= 0.0:
         raise ValueError(
-            f"device damping {device.damping:g} N s/m and tip damping {felt.damping:g} N s/m allow no coupling at "
+            f"device damping {device.damping:g} N s/m and tip damping {tip.damping:g} N s/m allow no coupling at "
             f"steps of {haptic_step * 1e3:g} ms: use a device with more damping"
         )
-    return VirtualCoupling(stiffness / scale, damping / scale)
+    return VirtualCoupling(stiffness, damping)
 
 
 def check_coupling(
-    coupling: VirtualCoupling, device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float, scale: float = 1.0
+    coupling: VirtualCoupling, device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float
 ) -> None:
     """Refuse a coupling that is too stiff for the device or the tip.
 
     Args:
-        coupling: between device and tip, in the scene's metres and newtons.
+        coupling: between device and tip.
         device: None if it exerts no force.
         tip: dynamics of the tip.
         haptic_step: T [s].
-        scale: factor on the coupling as seen by the device: the square of scene metres per device metre.
 
     Raises:
         ValueError: states the stiffness, the limit, its inputs, and the way out.
@@ -124,14 +120,12 @@ def check_coupling(
         )
     if device is None:
         return
-    # For the device the coupling is scale times as stiff: the same energies in the device's metres.
-    felt = TipDynamics(tip.mass * scale, tip.damping * scale)
-    limit = stiffness_limit(device, felt, coupling.damping * scale, haptic_step)
-    if coupling.stiffness * scale > limit:
+    limit = stiffness_limit(device, tip, coupling.damping, haptic_step)
+    if coupling.stiffness > limit:
         raise ValueError(
-            f"a coupling of {coupling.stiffness * scale:g} N/m at the device's handle is stiffer than {limit:.4g} N/m, "
+            f"a coupling of {coupling.stiffness:g} N/m at the device's handle is stiffer than {limit:.4g} N/m, "
             f"the passivity limit with device damping {device.damping:g} N s/m, tip damping "
-            f"{felt.damping:g} N s/m, coupling damping {coupling.damping * scale:g} N s/m, a haptic step of "
-            f"{haptic_step * 1e3:g} ms and a lag of {device.lag(haptic_step) * 1e3:g} ms: lower the stiffness or the "
+            f"{tip.damping:g} N s/m, coupling damping {coupling.damping:g} N s/m, a haptic step of "
+            f"{haptic_step * 1e3:g} ms and a lag of {device.delay * 1e3:g} ms: lower the stiffness or the "
             "coupling's damping, or use a device with more damping or less delay"
         )

@@ -11,17 +11,14 @@ class DevicePose(NamedTuple):
     """Pose of a device's handle.
 
     Fields:
-        position: in the device's own frame [m], shape (3,)
+        position: along the scene's axes [m], shape (3,)
         time: of reading, on a monotonic clock [s]
         buttons: one bit each, the first is 1
-        rotation: unit quaternion (w, x, y, z) from the handle's axes to the device's frame; None where not measured.
-            Not used in this version: a device moves a tip and does not turn it.
     """
 
     position: FloatArray
     time: float
     buttons: int = 0
-    rotation: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -31,8 +28,8 @@ class DeviceDynamics:
     Args:
         damping: viscous damping b of the device itself, without a hand [N s/m]; more of it allows a stiffer coupling.
         mass: apparent mass m at the handle [kg].
-        delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters.
-        pose_interval: time between two of its poses [s]; None: a pose each haptic step.
+        delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters, and
+            the interval of poses beyond a haptic step.
         force_largest: largest force that it can exert [N].
 
     Raises:
@@ -42,7 +39,6 @@ class DeviceDynamics:
     damping: float
     mass: float
     delay: float = 0.0
-    pose_interval: float | None = None
     force_largest: float = math.inf
 
     def __post_init__(self) -> None:
@@ -50,12 +46,6 @@ class DeviceDynamics:
         require_positive("device mass", self.mass, "kg")
         require_positive("device force_largest", self.force_largest, "N", finite=False)
         require_positive("device delay", self.delay, "s", or_zero=True)
-        if self.pose_interval is not None:
-            require_positive("device pose_interval", self.pose_interval, "s")
-
-    def lag(self, haptic_step: float) -> float:
-        """Delay beyond one haptic step [s]: the device's own, and that of less frequent poses."""
-        return self.delay + max(0.0, (self.pose_interval or haptic_step) - haptic_step)
 
 
 class HapticDevice(Protocol):
@@ -74,7 +64,7 @@ class HapticDevice(Protocol):
         ...
 
     def write(self, force: FloatArray) -> None:
-        """Push the hand with a force in the device's frame [N], shape (3,), until the next one."""
+        """Push the hand with a force along the scene's axes [N], shape (3,), until the next one."""
         ...
 
 

@@ -14,7 +14,7 @@ from msdm_core.organ.motion import SIGNAL
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import check_coupling, coupling_for
 from surgsim_env.haptics.device import DevicePose, HapticDevice
-from surgsim_env.haptics.settings import HapticSettings, WatchdogTimes
+from surgsim_env.haptics.settings import JAW_BIT, HapticSettings
 from surgsim_env.haptics.tip_drive import TipDrive, tip_drives
 from surgsim_env.instruments.arm.pair import SIDES, Pair
 
@@ -28,12 +28,11 @@ class TipTelemetry(NamedTuple):
     """One device and its tip in one haptic step.
 
     Fields:
-        pose: the device's last valid pose; None before the first
         fresh: whether it was read in this step
         target: the coupling's target in the scene [m]                                        (3,)
         tip: position of the tip at the start of the step [m]                                 (3,)
         coupling_force: of the coupling on the tip, in the scene [N]                          (3,)
-        force: on the device, in its own frame [N]                                            (3,)
+        force: on the device [N]                                                              (3,)
         contact_force: of the tissue on the tip, in the step that just ended [N]              (3,)
         depth: of the tip's ball, or of the point between its pads, below the resting surface where it touches [m]; 0
             without contact
@@ -48,7 +47,6 @@ class TipTelemetry(NamedTuple):
         energy: net work of the hand on the device since the reset [J]
     """
 
-    pose: DevicePose | None
     fresh: bool
     target: FloatArray
     tip: FloatArray
@@ -172,12 +170,12 @@ class Follower:
 class Watchdog:
     """Counts haptic steps without a fresh pose; `share` is the factor on the force, 0 before the first pose."""
 
-    def __init__(self, times: WatchdogTimes, haptic_step: float) -> None:
+    def __init__(self, settings: HapticSettings, haptic_step: float) -> None:
         """Count in steps of `haptic_step` [s]."""
         # Whole steps, so that rounding does not decide when the fading begins.
-        self._patience = max(1, math.ceil(times.timeout / haptic_step - 1e-9))
-        self._down = haptic_step / times.fade
-        self._up = haptic_step / times.resume
+        self._patience = max(1, math.ceil(settings.timeout / haptic_step - 1e-9))
+        self._down = haptic_step / settings.fade
+        self._up = haptic_step / settings.resume
         self.share = 0.0
         self._silent = self._patience
 
@@ -232,7 +230,7 @@ class HeldTip:
     """Reads the pose, writes the force, applies the coupling to the tip: once per haptic step, first."""
 
     def __init__(
-        self, device: HapticDevice, drive: TipDrive, settings: HapticSettings, depth: PressDepth, haptic_step: float
+        self, device: HapticDevice, drive: TipDrive, depth: PressDepth, settings: HapticSettings, haptic_step: float
     ) -> None:
         """Couple a device to a tip.
 
@@ -240,25 +238,21 @@ class HeldTip:
             ValueError: a coupling too stiff for device or tip, or a force limit above what either can exert.
         """
         self.device, self.drive, self.settings = device, drive, settings
-        frame, limits = settings.frame, settings.limits
-        scale = frame.scale**2
         dynamics, smoothing = device.dynamics, settings.smoothing
         if dynamics is None:
             smoothing = SMOOTHING if smoothing is None else smoothing
         elif smoothing:
             # The filtered path differs from the path by at most tau |dx/dt|, as for a lag of tau.
             dynamics = replace(dynamics, delay=dynamics.delay + smoothing)
-        self.coupling = settings.coupling or coupling_for(dynamics, drive.dynamics, haptic_step, scale)
-        check_coupling(self.coupling, dynamics, drive.dynamics, haptic_step, scale)
-        _check_force("instrument's servo", limits.force_largest, drive.force_largest)
+        self.coupling = settings.coupling or coupling_for(dynamics, drive.dynamics, haptic_step)
+        check_coupling(self.coupling, dynamics, drive.dynamics, haptic_step)
+        _check_force("instrument's servo", settings.force_largest, drive.force_largest)
         if device.dynamics is not None:
-            _check_force("device", limits.force_largest * frame.scale, device.dynamics.force_largest)
-        self._turn = np.array(frame.rotation, dtype=np.float64)
-        self._origin = np.array(frame.origin, dtype=np.float64)
+            _check_force("device", settings.force_largest, device.dynamics.force_largest)
         self._damping_rate = self.coupling.damping / haptic_step
         self._depth = depth
-        self._watchdog = Watchdog(settings.watchdog, haptic_step)
-        self._slew = SlewLimit(limits.slew_largest, haptic_step)
+        self._watchdog = Watchdog(settings, haptic_step)
+        self._slew = SlewLimit(settings.slew_largest, haptic_step)
         self._follower = Follower(
             drive.position, settings.approach_speed, settings.speed_largest, smoothing or 0.0, haptic_step
         )
@@ -290,10 +284,9 @@ class HeldTip:
         stretch = self._follower.place - self.drive.position
         pull = self.coupling.stiffness * stretch + self._damping_rate * (stretch - self._stretch)
         self._stretch = stretch
-        self._coupling_force, self._clamped = held_within(pull, self.settings.limits.force_largest)
+        self._coupling_force, self._clamped = held_within(pull, self.settings.force_largest)
         self.drive.push(self._coupling_force, contact_force)
-        wanted = (-share * self.settings.frame.scale) * (self._coupling_force @ self._turn)
-        self._force, self._slewed = self._slew.follow(wanted)
+        self._force, self._slewed = self._slew.follow(-share * self._coupling_force)
         self._write(self._force)
 
     def release(self) -> None:
@@ -317,7 +310,6 @@ class HeldTip:
         """The record of the step; `contact_force` [N], (3,), is the tissue's in it."""
         tip = self.drive.tool.tip_position
         return TipTelemetry(
-            pose=self._pose,
             fresh=self._fresh,
             target=self._follower.place,
             tip=tip,
@@ -361,15 +353,14 @@ class HeldTip:
             self._fault = f"writing: {error}"
 
     def _scene_place(self, position: FloatArray) -> FloatArray:
-        place = self.settings.frame.scale * (self._turn @ position)
         if self._shift is None:
-            self._shift = self._follower.place - place if self.settings.relative else self._origin
-        return place + self._shift
+            self._shift = self._follower.place - position if self.settings.relative else np.zeros(3)
+        return position + self._shift
 
     def _close_jaw(self, buttons: int) -> None:
-        if self.settings.jaw_button is None or self.drive.tool.jaw is None:
+        if self.drive.tool.jaw is None:
             return
-        pressed = bool(buttons >> self.settings.jaw_button & 1)
+        pressed = bool(buttons >> JAW_BIT & 1)
         if pressed != self._pressed:
             self._pressed = pressed
             self.drive.tool.command_jaw(-1.0 if pressed else 1.0)
@@ -377,7 +368,7 @@ class HeldTip:
 
 def _check_force(what: str, wanted: float, most: float) -> None:
     if wanted > most:
-        raise ValueError(f"limits.force_largest is {wanted:g} N; the {what} can exert {most:g} N: lower it")
+        raise ValueError(f"haptic force_largest is {wanted:g} N; the {what} can exert {most:g} N: lower it")
 
 
 class HapticLoop:
@@ -399,32 +390,30 @@ class HapticLoop:
         self,
         simulation: Simulation,
         devices: HapticDevice | Sequence[HapticDevice],
-        settings: HapticSettings | Sequence[HapticSettings] | None = None,
+        settings: HapticSettings | None = None,
     ) -> None:
         """Couple devices to the tips of an instrument at their present positions.
 
         Args:
             simulation: after a reset; only this loop may advance it.
             devices: one, or one per tip, the left arm's first.
-            settings: for all, or one for each.
+            settings: for all devices.
 
         Raises:
             ValueError: as many devices as there are not tips; a coupling that a device or tip cannot bear (says the
                 limit); a force beyond what device or servo can push with.
-            TypeError: an instrument that cannot be held so.
         """
         self.simulation = simulation
         scene, dt = simulation.anatomy.scene, simulation.haptic_dt
         many = list(devices) if isinstance(devices, Sequence) else [devices]
         drives = tip_drives(simulation.instrument, dt)
-        each = list(settings) if isinstance(settings, Sequence) else [settings or HapticSettings()] * len(many)
-        if len(many) != len(drives) or len(each) != len(many):
+        if len(many) != len(drives):
             raise ValueError(
-                f"{len(many)} devices and {len(each)} settings for the {len(drives)} tips of scene {scene.name!r}: "
-                "give one device for each tip, and settings for all or one for each"
+                f"{len(many)} devices for the {len(drives)} tips of scene {scene.name!r}: give one device for each tip"
             )
+        settings = settings or HapticSettings()
         depths = [PressDepth(simulation, 0.0 if drive.tool.jaw else scene.instrument.tip_radius) for drive in drives]
-        self.held = [HeldTip(*parts, dt) for parts in zip(many, drives, each, depths, strict=True)]
+        self.held = [HeldTip(*parts, settings, dt) for parts in zip(many, drives, depths, strict=True)]
         self.fault = simulation.fault
         instrument = simulation.instrument
         # Indices of the tools at each tip.

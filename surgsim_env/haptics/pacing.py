@@ -112,14 +112,13 @@ class Timeliness:
     """Timing of an interval of steps.
 
     Fields:
-        steps, skipped: numbers of steps made and skipped
+        skipped: number of steps skipped
         rate: steps per wall-clock time [1/s]
         real_time: simulated over wall-clock time
         late_p50, late_p99, late_most: median, 99 % quantile and largest lateness [s]
-        spent_p50, spent_p99: median and 99 % quantile of the steps' duration [s]
+        spent_p50: median of the steps' duration [s]
     """
 
-    steps: int
     skipped: int
     rate: float
     real_time: float
@@ -127,7 +126,6 @@ class Timeliness:
     late_p99: float
     late_most: float
     spent_p50: float
-    spent_p99: float
 
 
 def timeliness(before: NDArray, after: NDArray, wall: float) -> Timeliness:
@@ -137,17 +135,14 @@ def timeliness(before: NDArray, after: NDArray, wall: float) -> Timeliness:
     since the process started.
     """
     late, spent = after["late"] - before["late"], after["spent"] - before["spent"]
-    steps = int(after["steps"] - before["steps"])
     return Timeliness(
-        steps=steps,
         skipped=int(after["skipped"] - before["skipped"]),
-        rate=steps / wall,
+        rate=float(after["steps"] - before["steps"]) / wall,
         real_time=float(after["simulated"] - before["simulated"]) / wall,
         late_p50=quantile(late, 0.5),
         late_p99=quantile(late, 0.99),
         late_most=float(after["late_most"]) if late[-1] else quantile(late, 1.0),
         spent_p50=quantile(spent, 0.5),
-        spent_p99=quantile(spent, 0.99),
     )
 
 

@@ -36,18 +36,11 @@ class CartesianDrive:
     """
 
     def __init__(self, instrument: Instrument) -> None:
-        """Drive an instrument whose servo's first three joints are slides along x, y and z.
-
-        Raises:
-            TypeError: its first joints are not such slides.
-        """
+        """Drive an instrument whose servo's first three joints are slides along x, y and z."""
         model, servo = instrument.model, instrument.servo
         self.tool = instrument
         hold, pace = servo.position[:3], servo.speed[:3]
         joints = model.actuator_trnid[hold, 0]
-        slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
-        if len(hold) < 3 or not slides.all() or not np.allclose(model.jnt_axis[joints], np.eye(3)):
-            raise TypeError(f"{type(instrument).__name__} has no slides along x, y and z that could push its tip")
         self._hold, self._place, self._speed = hold, model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._stiffness, self._damping = model.actuator_gainprm[hold, 0], model.actuator_gainprm[pace, 0]
         self._gain = 1.0 / (self._stiffness * model.opt.timestep + self._damping)

@@ -3,7 +3,6 @@
 `docs/haptics.md` has the table of the two packets.
 """
 
-import ipaddress
 import math
 import socket
 import struct
@@ -15,23 +14,21 @@ from typing import NamedTuple
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.haptics.device import DeviceDynamics, DevicePose, require_positive
+from surgsim_env.haptics.device import DeviceDynamics, DevicePose
 
 # UDP port of the simulation, in no list of IANA.
 PORT = 47801
 MAGIC = b"SSHP"
 VERSION = 1
 KIND_POSE, KIND_FORCE = 1, 2
-# Little-endian, without gaps. Magic, version, kind, buttons, sequence, time; position, rotation.
-POSE = struct.Struct("<4sBBHId3d4d")
-# Magic, version, kind, zero, sequence and time of the answered pose; force.
-FORCE = struct.Struct("<4sBBHId3d")
-assert FORCE.size <= POSE.size
+# Little-endian, without gaps. Magic, version, kind, buttons (0 of a force), sequence, time (of a force those of the
+# pose that it answers); position or force.
+PACKET = struct.Struct("<4sBBHId3d")
 
 # Positions farther from the device's origin are refused [m].
 POSITION_LARGEST = 10.0
-# Tolerance on the length of a rotation's quaternion.
-ROTATION_SLACK = 1e-3
+# Time without poses after which another sender may attach [s].
+PEER_TIMEOUT = 1.0
 # Packets read per haptic step; the socket drops a flood of more.
 PACKETS_PER_READ = 16
 # Receive buffer of the socket [bytes]: a few tens of packets, so that a flood leaves no old ones.
@@ -46,62 +43,25 @@ class PosePacket(NamedTuple):
         time: on the sender's clock [s]; the answer repeats it
         position: [m], (3,)
         buttons: one bit each, 16 of them
-        rotation: unit quaternion (w, x, y, z), or None; checked, and not used in this version
     """
 
     sequence: int
     time: float
     position: FloatArray
     buttons: int = 0
-    rotation: FloatArray | None = None
-
-
-class ForcePacket(NamedTuple):
-    """A force as it travels: sequence and time of the pose that it answers, and the force [N], (3,)."""
-
-    sequence: int
-    time: float
-    force: FloatArray
-
-
-def pack_pose(pose: PosePacket) -> bytes:
-    """The 76 bytes of a pose."""
-    rotation = np.zeros(4) if pose.rotation is None else pose.rotation
-    header = (MAGIC, VERSION, KIND_POSE, pose.buttons, pose.sequence, pose.time)
-    return POSE.pack(*header, *pose.position.tolist(), *rotation.tolist())
 
 
 def unpack_pose(data: bytes) -> PosePacket | None:
-    """A pose of exactly 76 well-formed bytes; None for anything else."""
-    if len(data) != POSE.size:
+    """A pose of exactly 44 well-formed bytes; None for anything else."""
+    if len(data) != PACKET.size:
         return None
-    magic, version, kind, buttons, sequence, time, x, y, z, *turn = POSE.unpack(data)
+    magic, version, kind, buttons, sequence, time, x, y, z = PACKET.unpack(data)
     if magic != MAGIC or version != VERSION or kind != KIND_POSE or not math.isfinite(time):
         return None
     # No comparison with a NaN holds.
     if not all(abs(value) <= POSITION_LARGEST for value in (x, y, z)):
         return None
-    rotation = None
-    if any(turn):
-        if not abs(math.hypot(*turn) - 1.0) <= ROTATION_SLACK:
-            return None
-        rotation = np.array(turn)
-    return PosePacket(sequence, time, np.array((x, y, z)), buttons, rotation)
-
-
-def pack_force(force: ForcePacket) -> bytes:
-    """The 44 bytes of a force."""
-    return FORCE.pack(MAGIC, VERSION, KIND_FORCE, 0, force.sequence, force.time, *force.force.tolist())
-
-
-def unpack_force(data: bytes) -> ForcePacket | None:
-    """A force of exactly 44 well-formed bytes; None for anything else."""
-    if len(data) != FORCE.size:
-        return None
-    magic, version, kind, _, sequence, time, *force = FORCE.unpack(data)
-    if magic != MAGIC or version != VERSION or kind != KIND_FORCE or not all(map(math.isfinite, (time, *force))):
-        return None
-    return ForcePacket(sequence, time, np.array(force))
+    return PosePacket(sequence, time, np.array((x, y, z)), buttons)
 
 
 def newer(sequence: int, last: int) -> bool:
@@ -131,10 +91,10 @@ class UdpCounts:
 
 
 class UdpDevice:
-    """Listens on a loopback address; the sender of the first valid packet is attached.
+    """Listens on 127.0.0.1, as packets are not authenticated; the sender of the first valid packet is attached.
 
-    Each pose is answered by one force, a shorter packet; nothing else is sent. If the attached sender sends no new
-    valid pose for `peer_timeout`, the next sender of one is attached, possibly the same one with new sequence numbers.
+    Each pose is answered by one force, a packet of the same size; nothing else is sent. If the attached sender sends no
+    new valid pose for PEER_TIMEOUT, the next sender of one is attached, maybe the same one with new sequence numbers.
 
     Fields:
         counts: numbers of packets so far
@@ -145,34 +105,28 @@ class UdpDevice:
         self,
         port: int = 0,
         *,
-        host: str = "127.0.0.1",
         dynamics: DeviceDynamics | None = None,
-        peer_timeout: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Bind a socket.
 
         Args:
             port: 0 for a free one.
-            host: a loopback address, because packets are not authenticated.
             dynamics: of the device; None if it exerts no force.
-            peer_timeout: time without poses after which another sender may attach [s].
             clock: monotonic clock [s].
 
         Raises:
-            ValueError: a host that is not a loopback address, a port or a time out of range.
+            ValueError: a port out of range.
             OSError: the port is taken.
         """
-        require_positive("peer_timeout", peer_timeout, "s")
         if not 0 <= port <= 65535:
             raise ValueError(f"port is {port!r}; it must be from 0 to 65535, 0 for a free one")
-        address = _loopback(host)
-        self.dynamics, self._peer_timeout, self._clock = dynamics, peer_timeout, clock
-        self._socket = socket.socket(socket.AF_INET if address.version == 4 else socket.AF_INET6, socket.SOCK_DGRAM)
+        self.dynamics, self._clock = dynamics, clock
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_SIZE)
-            self._socket.bind((host, port))
+            self._socket.bind(("127.0.0.1", port))
         except OSError:
             self._socket.close()
             raise
@@ -187,20 +141,15 @@ class UdpDevice:
         """Host and port of the socket."""
         return self._socket.getsockname()[:2]
 
-    @property
-    def peer(self) -> tuple[str, int] | None:
-        """Host and port of the attached sender, or None."""
-        return None if self._peer is None else (self._peer[0], self._peer[1])
-
     def read(self) -> DevicePose | None:
         """The newest valid pose since the last call, or None."""
         now, newest = self._clock(), None
-        if self._peer is not None and now - self._heard > self._peer_timeout:
+        if self._peer is not None and now - self._heard > PEER_TIMEOUT:
             self._peer = self._last = None
         for _ in range(PACKETS_PER_READ):
             try:
                 # One byte more than a pose, to detect longer packets.
-                data, sender = self._socket.recvfrom(POSE.size + 1)
+                data, sender = self._socket.recvfrom(PACKET.size + 1)
             except BlockingIOError:
                 break
             except OSError:
@@ -211,14 +160,14 @@ class UdpDevice:
         if newest is None:
             return None
         self._unanswered = True
-        return DevicePose(newest.position, now, newest.buttons, newest.rotation)
+        return DevicePose(newest.position, now, newest.buttons)
 
     def write(self, force: FloatArray) -> None:
         """Answer the last pose with a force [N], (3,), unless it has been answered."""
         if not self._unanswered or self._last is None or self._peer is None:
             return
         self._unanswered = False
-        packet = pack_force(ForcePacket(self._last.sequence, self._last.time, force))
+        packet = PACKET.pack(MAGIC, VERSION, KIND_FORCE, 0, self._last.sequence, self._last.time, *force.tolist())
         try:
             self._socket.sendto(packet, self._peer)
         except OSError:
@@ -245,16 +194,3 @@ class UdpDevice:
         self.counts.accepted += 1
         self._peer, self._heard, self._last = sender, now, pose
         return pose
-
-
-def _loopback(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        address = None
-    if address is None or not address.is_loopback:
-        raise ValueError(
-            f"host is {host!r}; a UDP device listens only on a loopback address such as 127.0.0.1, because its packets "
-            "are not authenticated: connect a device of another machine through a tunnel of your own"
-        )
-    return address

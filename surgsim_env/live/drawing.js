@@ -1,4 +1,4 @@
-// How a browser draws: how many frames it comes to, and, without a graphics card, without what nobody misses there.
+// Without a graphics card a browser draws without what nobody misses there.
 window.surgsim = (() => {
   "use strict";
   const software = (() => {
@@ -9,10 +9,8 @@ window.surgsim = (() => {
     gl.getExtension("WEBGL_lose_context")?.loseContext();
     return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
   })();
-  const state = { software, frames: 0 };
+  const state = { software };
   const frame = window.requestAnimationFrame.bind(window);
-  const count = () => { state.frames += 1; frame(count); };
-  frame(count);
   if (!software) return state;
 
   // Smoothed edges, and a picture kept to be read again, cost a quarter of the time.

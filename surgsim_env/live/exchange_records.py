@@ -136,27 +136,23 @@ class Phase(IntEnum):
 
 
 def hand_type(arm_count: int) -> np.dtype:
-    """Page to physics: target of each arm [m], its buttons, a beat that counts up, the number of requests sent."""
-    return np.dtype(
-        [("target", "f8", (arm_count, 3)), ("buttons", "i8", (arm_count,)), ("beat", "i8"), ("requests", "i8")]
-    )
+    """Page to physics: target of each arm [m], its buttons, a beat that counts up."""
+    return np.dtype([("target", "f8", (arm_count, 3)), ("buttons", "i8", (arm_count,)), ("beat", "i8")])
 
 
 def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
     """Physics to page, some 60 times a second.
 
-    phase, organ (its number, from 1), recording, the number of recordings begun, replaying, whether the breath is held,
-    time [s] since the reset, a message (a fault or a refusal), added_mass [kg]; for each arm: tip and target [m], the
-    forces of tissue and device on it [N], the share of the force that the watchdog passes, whether a limit acts; nodes
-    [m]; positions [m] and rotations of geoms.
+    phase, organ (its number, from 1), recording, the number of recordings begun, whether the breath is held, time [s]
+    since the reset, a message (a fault or a refusal), added_mass [kg]; for each arm its tip [m] and the force of tissue
+    on it [N]; nodes [m]; positions [m] and rotations of geoms.
     """
     arms = (arm_count, 3)
     return np.dtype(
         [
-            ("phase", "i4"), ("organ", "i8"), ("recording", "?"), ("recordings", "i8"), ("replaying", "?"),
+            ("phase", "i4"), ("organ", "i8"), ("recording", "?"), ("recordings", "i8"),
             ("breath_held", "?"), ("time", "f8"), ("said", f"S{TEXT_MOST}"), ("added_mass", "f8"),
-            ("tip", "f8", arms), ("place", "f8", arms), ("force", "f8", arms), ("pushed", "f8", arms),
-            ("share", "f8", (arm_count,)), ("limited", "?", (arm_count,)), ("node", "f4", (node_count, 3)),
+            ("tip", "f8", arms), ("force", "f8", arms), ("node", "f4", (node_count, 3)),
             ("geom", "f4", (geom_count, 3)), ("turn", "f4", (geom_count, 9)),
         ]
     )  # fmt: skip
@@ -177,7 +173,7 @@ def trace_type(arm_count: int) -> np.dtype:
             ("peak", "f8", (arm_count,)),
         ]
     )
-    return np.dtype([("organ", "i8"), ("count", "i8"), ("row", row, (TRACE_LENGTH,))])
+    return np.dtype([("count", "i8"), ("row", row, (TRACE_LENGTH,))])
 
 
 def recording_type(arm_count: int) -> np.dtype:
@@ -195,7 +191,7 @@ def recording_type(arm_count: int) -> np.dtype:
 
 
 class RecordedSteps:
-    """A recording in shared memory; its count is written last, by one process at a time."""
+    """A recording in shared memory; its count is written last."""
 
     def __init__(self, arm_count: int, most: int = RECORDING_MOST) -> None:
         """Begin empty."""
@@ -226,23 +222,10 @@ class RecordedSteps:
         step["time"], step["hand"], step["buttons"], step["tip"], step["force"] = time, hand, buttons, tip, force
         self._shared.counter[0] += 1
 
-    def fill(self, steps: NDArray[Any]) -> None:
-        """Replace all steps, such as by those of a file.
-
-        Raises:
-            ValueError: more steps than RECORDING_MOST.
-        """
-        most = len(self._shared.rows)
-        if len(steps) > most:
-            raise ValueError(f"a recording of {len(steps)} steps is longer than the {most} that fit: shorten it")
-        self.clear()
-        self._shared.rows[: len(steps)] = steps
-        self._shared.counter[0] = len(steps)
-
 
 @dataclass(frozen=True)
 class Exchange:
-    """Shared memory of a session. The page writes `hand` and, before a replay, `recorded`; the physics all others."""
+    """Shared memory of a session. The page writes `hand`, the physics all others."""
 
     hand: SharedRecord
     frame: SharedRecord
@@ -260,11 +243,6 @@ def new_exchange(arm_count: int, node_count: int, geom_count: int) -> Exchange:
         timing=SharedRecord(TIMING),
         recorded=RecordedSteps(arm_count),
     )
-
-
-def encoded(text: str) -> bytes:
-    """A text in UTF-8, cut to the TEXT_MOST bytes that a frame holds."""
-    return text.encode("utf-8")[:TEXT_MOST].decode("utf-8", "ignore").encode("utf-8")
 
 
 # ---- requests of the page, sent through a pipe ---------------------------------------------------------------------
@@ -297,16 +275,8 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Replay:
-    """Play the recording from its start, or stop; with `given` it was read from a file and starts at rest."""
-
-    on: bool
-    given: bool = False
-
-
-@dataclass(frozen=True)
 class End:
     """End the physics' process."""
 
 
-Request = Pause | Reset | Change | Record | Replay | End
+Request = Pause | Reset | Change | Record | End

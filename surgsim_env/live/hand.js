@@ -1,22 +1,14 @@
 // Keys and gamepads steer the instrument: packets as messages.py has them, 40 times a second while something is held.
-// Every second the server is told how the browser draws (drawing.js).
+// A browser without a graphics card tells the server (drawing.js).
 (() => {
   "use strict";
   const PERIOD = 25, DEAD = 0.12;
   const held = new Set();
   let arm = 0, socket = null, wasMoving = false, armButton = false, jaw = false, jawButton = false;
-  const report = (rate) => {
-    if (socket === null || socket.readyState !== WebSocket.OPEN) return;
-    const packet = new DataView(new ArrayBuffer(8));
-    packet.setFloat32(0, Math.min(rate ?? 0, 1000), true);
-    packet.setUint16(4, rate === null ? 0 : 1, true);
-    packet.setUint16(6, window.surgsim.software ? 1 : 0, true);
-    socket.send(packet.buffer);
-  };
   const connect = () => {
     // Below the page's own address, which begins with the token.
     socket = new WebSocket(location.origin.replace(/^http/, "ws") + location.pathname.replace(/\/$/, "") + "/hand");
-    socket.onopen = () => report(null);
+    socket.onopen = () => { if (window.surgsim.software) socket.send(new TextEncoder().encode("software")); };
     socket.onclose = () => { socket = null; setTimeout(connect, 1000); };
   };
   const typing = () => {
@@ -71,13 +63,5 @@
     }
     wasMoving = moving;
   }, PERIOD);
-  // The server sends no more pictures than the browser comes to.
-  let since = performance.now();
-  setInterval(() => {
-    const now = performance.now(), rate = (1000 * window.surgsim.frames) / (now - since);
-    since = now;
-    window.surgsim.frames = 0;
-    if (!document.hidden) report(rate);
-  }, 1000);
   connect();
 })();

@@ -12,9 +12,9 @@ from websockets.exceptions import ConnectionClosed
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.haptics.pacing import timeliness
-from surgsim_env.live.exchange_records import Change, LiveError, Pause, Phase, Record, Replay, Reset
+from surgsim_env.live.exchange_records import Change, LiveError, Pause, Phase, Record, Reset
 from surgsim_env.live.guarded_server import GuardedServer
-from surgsim_env.live.messages import InvalidMessageError, read_hand, read_report
+from surgsim_env.live.messages import SOFTWARE, read_hand
 from surgsim_env.live.organ_choice import chosen_lesions
 from surgsim_env.live.panel import Panel, status_rows
 from surgsim_env.live.recording import write_recording
@@ -25,84 +25,31 @@ from surgsim_env.live.stage import SCALE, FeltMap, ForceArrow, InstrumentView, O
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
 # Longest wait for the physics to end a recording [s].
 END_TIMEOUT = 2.0
-# Largest and smallest picture rate [1/s].
-RATE_MOST, RATE_LEAST = 30.0, 6.0
-# Frames that a browser should draw per picture; factors by which a report changes the rate.
-HEADROOM, SLOWER, QUICKER = 1.15, 0.85, 1.08
-# Older reports are ignored: the tab is in the background [s].
-REPORT_AGE_MOST = 5.0
-
-
-class PictureRate:
-    """Adapts the picture rate to the slowest browser; without a report it is RATE_MOST.
-
-    A browser that cannot keep up would draw ever older pictures, and on a machine with two processors take time from
-    the physics.
-
-    Fields:
-        rate: pictures to send now [1/s]
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin with the largest rate."""
-        self.rate = RATE_MOST
-        self._clock = clock
-        self._reports: dict[int, tuple[float, float]] = {}
-
-    @property
-    def slowest(self) -> float | None:
-        """Frame rate of the slowest browser [1/s]; None without reports."""
-        now = self._clock()
-        recent = [rate for rate, heard in self._reports.values() if now - heard < REPORT_AGE_MOST]
-        return min(recent, default=None)
-
-    def report(self, tab: int, rate: float) -> None:
-        """Process a tab's frame rate [1/s]."""
-        self._reports[tab] = (rate, self._clock())
-        slowest = self.slowest
-        assert slowest is not None
-        if rate <= slowest:
-            factor = QUICKER if rate >= HEADROOM * self.rate else SLOWER
-            self.rate = min(RATE_MOST, max(RATE_LEAST, factor * self.rate))
-
-    def forget(self, tab: int) -> None:
-        """Remove a closed tab."""
-        self._reports.pop(tab, None)
-        if self.slowest is None:
-            self.rate = RATE_MOST
+# Time between pictures [s].
+PICTURE_PERIOD = 1.0 / 30.0
 
 
 class HandSockets:
     """The sockets that `hand.js` opens, one per tab.
 
     Fields:
-        rate: the picture rate
         software: whether a tab without a graphics card was opened
     """
 
     def __init__(self, session: Session) -> None:
         """Push a session's hands."""
         self._session = session
-        self.rate = PictureRate()
         self.software = False
 
     async def serve(self, connection: ServerConnection) -> None:
-        """Serve one tab until it is closed or sends an invalid message."""
-        tab = id(connection)
+        """Serve one tab until it is closed."""
         with contextlib.suppress(ConnectionClosed, asyncio.CancelledError):
             while True:
-                message = await connection.recv()
-                try:
-                    report = read_report(message)
-                    if report is None:
-                        self._session.push(read_hand(message, arm_count=max(2, self._session.arm_count)))
-                        continue
-                    self.software = self.software or report.software
-                    if report.rate is not None:
-                        self.rate.report(tab, report.rate)
-                except InvalidMessageError as error:
-                    await connection.close(1008, str(error)[:100])
-        self.rate.forget(tab)
+                message = await connection.recv(decode=False)
+                if message == SOFTWARE:
+                    self.software = True
+                else:
+                    self._session.push(read_hand(message))
 
 
 class Page:
@@ -136,7 +83,7 @@ class Page:
         self._shows_lesions = False
         # Number of recordings written; the physics counts those begun.
         self._recordings_written = 0
-        self._doing: tuple[int, bool, bool] | None = None
+        self._doing: tuple[int, bool] | None = None
         self._said = ""
         # None: neither a browser nor the user has chosen yet.
         self._plain: bool | None = None
@@ -173,7 +120,6 @@ class Page:
             "pause": lambda: session.ask(Pause(session.frame()["phase"] != Phase.PAUSED)),
             "reset": self._reset,
             "record": lambda: session.ask(Record(not session.frame()["recording"])),
-            "replay": lambda: session.ask(Replay(not session.frame()["replaying"])),
             "show_lesions": self._show_lesions,
             "paint": self._organ.show_paint,
             "clear_map": self.felt.clear,
@@ -183,13 +129,13 @@ class Page:
         }
 
     def show_plain(self, on: bool) -> None:
-        """Turn shadows, reflections and the finest triangles off or on, in every tab."""
-        self._plain = self._organ.plain = on
+        """Turn shadows and reflections off or on, in every tab."""
+        self._plain = on
         self._surroundings.show_plain(on)
         self._panel.show_plain(on)
 
     def run(self, until: Callable[[], bool]) -> None:
-        """Send pictures until `until()` holds, at the rate that the browsers can draw.
+        """Send pictures until `until()` holds.
 
         Raises:
             LiveError: the physics died.
@@ -212,8 +158,7 @@ class Page:
             if now >= status_due:
                 status_due = now + STATUS_PERIOD
                 self._say(frame)
-            period = 1.0 / self._tabs.rate.rate
-            due = max(due + period, time.monotonic() - period)
+            due = max(due + PICTURE_PERIOD, time.monotonic() - PICTURE_PERIOD)
             time.sleep(max(0.0, due - time.monotonic()))
 
     def end_recording(self) -> str:
@@ -279,7 +224,7 @@ class Page:
         if begun > self._recordings_written and not recording:
             self._recordings_written = begun
             self._said = write_recording(session.exchange.recorded.steps.copy(), self._out)
-        doing = (int(frame["phase"]), recording, bool(frame["replaying"]))
+        doing = (int(frame["phase"]), recording)
         if doing != self._doing:
             self._doing = doing
             self._show_phase(frame)
@@ -320,7 +265,6 @@ class Page:
             kept,
             skipped=int(now[0]["skipped"]),
             fps=fps,
-            drawn=self._tabs.rate.slowest,
             said=self._said,
             has_breath=self.session.scene.has_breath,
         )

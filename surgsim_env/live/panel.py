@@ -63,7 +63,7 @@ class Panel:
             scene: of the session.
             arm_count: 1 or 2.
             has_jaw: whether the first arm has a jaw.
-            calls: callbacks by name: pause(), record() and replay(), which toggle;
+            calls: callbacks by name: pause() and record(), which toggle;
                 reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), hold_breath(on), plain(on).
         """
         self._gui, self._scene, self._calls = gui, scene, calls
@@ -107,8 +107,6 @@ class Panel:
         _set(self._breath, "value", breath_held)
         _set(self._pause, "label", "Continue" if frame["phase"] == Phase.PAUSED else "Pause")
         _set(self._record, "label", f"End recording ({recorded:.0f} s)" if recording else "Record")
-        _set(self._replay, "label", "End replay" if frame["replaying"] else f"Replay ({recorded:.1f} s)")
-        _set(self._replay, "disabled", recorded == 0.0 or recording)
 
     def show_plain(self, on: bool) -> None:
         """Set its check box."""
@@ -136,9 +134,6 @@ class Panel:
         self._pause = self._button("Pause", "pause the physics, or continue", calls["pause"])
         self._button("Reset", "the same organ at rest, tips parked", calls["reset"])
         self._record = self._button("Record", "record hands, tips and forces at 1 kHz to a CSV file", calls["record"])
-        hint = "repeat the recorded motion from the recording's initial state"
-        self._replay = self._button("Replay", hint, calls["replay"])
-        self._replay.disabled = True
 
     def _add_tissue(self) -> None:
         gui, scene = self._gui, self._scene
@@ -251,8 +246,6 @@ def _legend_html() -> str:
 
 def headline(frame: NDArray[Any]) -> str:
     """The state of the physics in a frame, in words."""
-    if frame["replaying"]:
-        return "replaying"
     return "recording" if frame["recording"] else TITLES[Phase(int(frame["phase"]))]
 
 
@@ -262,7 +255,6 @@ def status_rows(
     *,
     skipped: int,
     fps: float,
-    drawn: float | None,
     said: str,
     has_breath: bool = False,
 ) -> list[tuple[str, str]]:
@@ -273,7 +265,6 @@ def status_rows(
         kept: timing of the steps since the last call.
         skipped: steps skipped since the start.
         fps: pictures sent [1/s].
-        drawn: pictures drawn by the slowest browser [1/s], None if unknown.
         said: message of the page, shown when the physics has none.
         has_breath: whether the patient has a breath that can be held.
     """
@@ -286,7 +277,7 @@ def status_rows(
         ("late, median / 99 %", f"{kept.late_p50 * 1e3:.2f} / {kept.late_p99 * 1e3:.2f} ms"),
         ("a step takes", f"{kept.spent_p50 * 1e3:.2f} ms"),
         ("steps skipped so far", f"{skipped}"),
-        ("pictures", f"{fps:.0f} /s" + ("" if drawn is None else f" (browser {drawn:.0f})")),
+        ("pictures", f"{fps:.0f} /s"),
     ]
     if has_breath:
         rows.insert(2, ("breath", "held" if frame["breath_held"] else "goes on"))

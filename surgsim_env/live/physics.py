@@ -1,7 +1,6 @@
 """The physics of a live session: haptic steps in real time that follow the page's hands, requests between them."""
 
 import contextlib
-import ctypes
 import gc
 import math
 import os
@@ -34,10 +33,8 @@ from surgsim_env.live.exchange_records import (
     Pause,
     Phase,
     Record,
-    Replay,
     Request,
     Reset,
-    encoded,
 )
 from surgsim_env.live.organ_choice import OrganChoice, chosen_organ
 from surgsim_env.rendering.scene_model import shown_geoms
@@ -46,8 +43,6 @@ from surgsim_env.scene.model import Scene
 
 # Steps between frames for the page, and between checks of the parent process and of requests.
 FRAME_STEPS, LOOK_STEPS = 16, 8
-# Requests handled per check; others wait for the next.
-REQUESTS_MOST = 4
 # Largest speeds at which a tip follows its hand, in general and on the way to the organ [m/s].
 SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
 # Initial distance of a tip on slides from the organ, and smallest distance of any contact shape [m].
@@ -90,25 +85,23 @@ def _clearance(anatomy: Anatomy, instrument: Instrument, shift: FloatArray) -> f
 
 
 class BrowserDevice:
-    """A `HapticDevice` whose pose a web page sets, or a recording during a replay; it exerts no force.
+    """A `HapticDevice` whose pose a web page sets; it exerts no force.
 
     While the page's process is alive every step has a pose, since a hand at rest sends no messages. After 20 steps
     without a beat there is none, and the loop's watchdog fades the force.
 
     Fields:
         pose: of the last step; None without one
-        replayed: number of steps of the recording that were replayed; None while the page sets the pose
     """
 
     dynamics = None
 
     def __init__(self, exchange: Exchange, arm: int, step: float, place: FloatArray) -> None:
         """Follow one arm's target in steps [s], from where its tip is [m], (3,)."""
-        self._hand, self._recorded, self._arm, self._step_time = exchange.hand, exchange.recorded, arm, step
+        self._hand, self._arm, self._step_time = exchange.hand, arm, step
         self._share = 1.0 - math.exp(-step / SMOOTHING)
         self._beat, self._buttons = -1, 0
         self.pose: DevicePose | None = None
-        self.replayed: int | None = None
         self.restart(place)
 
     def restart(self, place: FloatArray) -> None:
@@ -117,14 +110,7 @@ class BrowserDevice:
         self._steps, self._silent = 0, SILENT_STEPS_MOST
 
     def read(self) -> DevicePose | None:
-        """The smoothed pose, None when the page's process is dead; in a replay the recorded one."""
-        self.pose = self._page_pose() if self.replayed is None else self._recorded_pose(self.replayed)
-        return self.pose
-
-    def write(self, force: FloatArray) -> None:
-        """Nothing to do: the page displays the forces of frames."""
-
-    def _page_pose(self) -> DevicePose | None:
+        """The smoothed pose, None when the page's process is dead."""
         self._steps += 1
         record = self._hand.glance()
         if record is None or int(record["beat"]) == self._beat:
@@ -132,20 +118,14 @@ class BrowserDevice:
         else:
             self._beat, self._silent = int(record["beat"]), 0
             self._target, self._buttons = record["target"][self._arm].copy(), int(record["buttons"][self._arm])
-        if self._silent >= SILENT_STEPS_MOST:
-            return None
-        self._place = self._place + self._share * (self._target - self._place)
-        return DevicePose(self._place, self._steps * self._step_time, self._buttons)
+        self.pose = None
+        if self._silent < SILENT_STEPS_MOST:
+            self._place = self._place + self._share * (self._target - self._place)
+            self.pose = DevicePose(self._place, self._steps * self._step_time, self._buttons)
+        return self.pose
 
-    def _recorded_pose(self, index: int) -> DevicePose | None:
-        """The pose of a recorded step; None where the recording has none, and after its end."""
-        if index >= self._recorded.count:
-            return None
-        self.replayed = index + 1
-        step = self._recorded.steps[index]
-        place = step["hand"][self._arm].copy()
-        buttons = int(step["buttons"][self._arm])
-        return DevicePose(place, float(step["time"]), buttons) if np.isfinite(place).all() else None
+    def write(self, force: FloatArray) -> None:
+        """Nothing to do: the page displays the forces of frames."""
 
 
 class Physics:
@@ -172,10 +152,7 @@ class Physics:
         self._phase, self._said = Phase.RUNNING, ""
         # The page counts recordings: one may begin and end between two of its looks.
         self._recording, self._recordings = False, 0
-        self._start_state: dict[str, np.ndarray] | None = None
         self._peak = np.zeros(len(self._hands))
-        # Number of requests handled; earlier ones wait in the pipe.
-        self._asked = 0
         # The first step loads or compiles the kernels.
         self._last = self._loop.step()
         self._restart()
@@ -202,23 +179,17 @@ class Physics:
         """Handle requests; False to end."""
         if not parent_lives():
             return False
-        asked = int(self._exchange.hand.peek["requests"])
-        if asked == self._asked:
-            return True
         took_long = False
         try:
-            for _ in range(REQUESTS_MOST):
-                if not self._requests.poll():
-                    break
+            while self._requests.poll():
                 request = self._requests.recv()
                 if isinstance(request, End):
                     return False
-                self._asked += 1
                 self._handle(request)
-                took_long = took_long or isinstance(request, Change | Replay | Reset)
+                took_long = took_long or isinstance(request, Change | Reset)
         except (EOFError, OSError):
             return False
-        # Compiling an organ or restoring a state takes longer than a step, so the pacing starts again. Other requests
+        # Compiling an organ takes longer than a step, so the pacing starts again. Other requests
         # are handled within a step, and their time counts as lateness.
         if took_long:
             self._pacer.start()
@@ -235,13 +206,10 @@ class Physics:
             self._change(request.choice)
         elif isinstance(request, Record):
             self._record(request.on)
-        elif isinstance(request, Replay):
-            self._replay(request)
         self._write_frame()
 
     def _rest(self, organ: OrganModel | None = None) -> None:
         self._recording = False
-        self._replay_from(None)
         self._loop.reset(organ, self._home)
         self._restart()
 
@@ -251,7 +219,7 @@ class Physics:
         for hand, held in zip(self._hands, self._loop.held, strict=True):
             hand.restart(held.drive.tool.tip_position)
         with self._exchange.trace.writing() as trace:
-            trace["organ"], trace["count"] = self._organ_number, 0
+            trace["count"] = 0
         self._peak[:] = 0.0
         untouched = tuple(held.telemetry(np.zeros(3)) for held in self._loop.held)
         self._last = HapticTelemetry(self._simulation.time, "", untouched)
@@ -263,7 +231,7 @@ class Physics:
             organ = chosen_organ(self._anatomy, choice)
             self._organ_number += 1
             self._rest(organ)
-            self._organ, self._start_state = organ, None
+            self._organ = organ
         except ValueError as error:
             self._organ_number = number
             self._rest(before)
@@ -272,43 +240,13 @@ class Physics:
     def _record(self, on: bool) -> None:
         if on and self._recording:
             return
-        if on and not self._replaying:
+        if on:
             self._exchange.recorded.clear()
-            # The couplings restart here and in a replay, so that both begin in the same state.
-            self._start_state = self._simulation.get_state()
-            for held in self._loop.held:
-                held.restart()
             self._recordings += 1
-        self._recording = on and not self._replaying
-
-    def _replay(self, request: Replay) -> None:
-        self._recording = False
-        if not request.on or self._exchange.recorded.count == 0:
-            self._replay_from(None)
-            return
-        if request.given or self._start_state is None:
-            # The patient moves as at the first step's time.
-            start = float(self._exchange.recorded.steps["time"][0]) - self._simulation.haptic_dt
-            self._loop.reset(None, self._home, elapsed=max(0.0, start))
-        else:
-            self._simulation.set_state(self._organ, self._start_state)
-            self._loop.fault = self._simulation.fault
-            for held in self._loop.held:
-                held.restart()
-        self._restart()
-        self._replay_from(0)
-
-    @property
-    def _replaying(self) -> bool:
-        return self._hands[0].replayed is not None
-
-    def _replay_from(self, step: int | None) -> None:
-        """Replay the recording from a step on, or with None return the hands to the page."""
-        for hand in self._hands:
-            hand.replayed = step
+        self._recording = on
 
     def _record_step(self, told: HapticTelemetry) -> None:
-        """Add a step to the trace and the recording, and react to the end of a replay and to faults."""
+        """Add a step to the trace and the recording, and react to faults."""
         exchange, simulation = self._exchange, self._simulation
         for arm, tip in enumerate(told.tips):
             x, y, z = tip.contact_force.tolist()
@@ -335,10 +273,6 @@ class Physics:
                 exchange.recorded.append(
                     told.time, places, buttons, tips, np.array([tip.contact_force for tip in told.tips])
                 )
-        if self._hands[0].replayed == exchange.recorded.count:
-            self._replay_from(None)
-            for hand, held in zip(self._hands, self._loop.held, strict=True):
-                hand.restart(held.drive.tool.tip_position)
         if told.fault:
             self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
             self._write_frame()
@@ -350,15 +284,12 @@ class Physics:
         with self._exchange.frame.writing() as frame:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
             frame["recording"], frame["recordings"] = self._recording, self._recordings
-            frame["replaying"] = self._replaying
             frame["breath_held"] = simulation.holds_breath
-            frame["time"], frame["said"] = simulation.time, encoded(self._said)
+            frame["time"], frame["said"] = simulation.time, self._said.encode()
             frame["added_mass"] = self._organ.added_mass
             for arm, tip in enumerate(told.tips):
                 frame["tip"][arm] = self._loop.held[arm].drive.tool.tip_position
-                frame["place"][arm], frame["force"][arm] = tip.target, tip.contact_force
-                frame["pushed"][arm], frame["share"][arm] = tip.force, tip.share
-                frame["limited"][arm] = tip.clamped or tip.workspace_limited
+                frame["force"][arm] = tip.contact_force
             frame["node"] = simulation.organ_state.node_position[:, :3]
             frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
 
@@ -376,7 +307,6 @@ def run_physics(
     """
     # The page's process handles Ctrl-C and ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _set_timer_slack()
     _raise_priority()
     try:
         physics = Physics(scene, choice, pace, exchange, requests)
@@ -403,10 +333,3 @@ def _raise_priority() -> None:
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(NICENESS))
-
-
-def _set_timer_slack() -> None:
-    """Set the timer slack of Linux to 1 ns: sleeps otherwise end up to 50 us late."""
-    if sys.platform == "linux":
-        set_timer_slack = 29
-        ctypes.CDLL(None).prctl(set_timer_slack, 1, 0, 0, 0)

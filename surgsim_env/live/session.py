@@ -79,7 +79,6 @@ class Session:
         self._motions: dict[int, tuple[FloatArray, float]] = {}
         self._clock = clock
         self._lock = threading.Lock()
-        self._requests = 0
         spawn = multiprocessing.get_context("spawn")
         self._pipe, child = spawn.Pipe()
         pace = pace or PaceSettings(period=self.scene.timing.haptic_step)
@@ -160,20 +159,12 @@ class Session:
         with self._lock:
             if isinstance(request, Change):
                 self.choice = request.choice
-            try:
+            # Where the physics is gone, `alive` says so.
+            with contextlib.suppress(OSError):
                 self._pipe.send(request)
-            except OSError:
-                return  # The physics is gone; `alive` says so.
-            self._requests += 1
 
     def move_to(self, arm: int, target: FloatArray) -> None:
-        """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm.
-
-        Raises:
-            ValueError: the target is not finite.
-        """
-        if not np.isfinite(target).all():
-            raise ValueError(f"the target of a hand is {target}; it must be finite")
+        """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm."""
         with self._lock:
             self._targets[arm] = np.clip(target, self.instrument.lower - 0.01, self.instrument.upper + 0.01)
 
@@ -208,7 +199,7 @@ class Session:
 
     @property
     def breath_held(self) -> bool:
-        """Whether the page holds the breath; in a replay the recording does, or does not."""
+        """Whether the page holds the breath."""
         return bool(self._buttons[0] & BREATH_BUTTON)
 
     def close(self) -> None:
@@ -248,4 +239,3 @@ class Session:
         with self.exchange.hand.writing() as hand:
             hand["target"], hand["buttons"] = self._targets, self._buttons
             hand["beat"] += 1
-            hand["requests"] = self._requests

@@ -13,7 +13,7 @@ from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.palpation.touches import Indenter
 from surgsim_env.rendering.cameras import Camera, scene_cameras
-from surgsim_env.rendering.embedding import boundary_surface, organ_surface
+from surgsim_env.rendering.embedding import organ_surface
 from surgsim_env.rendering.scene_model import geom_colour, is_support, mesh_rows
 from surgsim_env.rendering.tissue import lesion_ball
 from surgsim_env.scene.anatomy import Anatomy
@@ -60,8 +60,6 @@ COLOURS = (
     (240, 117, 48),
     (205, 46, 46),
 )
-# Most triangles in plain mode, which draws the simulation's boundary, unless that has more.
-PLAIN_TRIANGLES_MOST = 5_000
 # Offset of the paint above the surface [m].
 PAINT_ABOVE = 0.0004
 NO_FACES = np.zeros((0, 3), dtype=np.int32)
@@ -173,20 +171,16 @@ class OrganView:
 
     Fields:
         paints: whether the stiffness map is shown
-        plain: whether to draw fewer triangles, from the next picture on
     """
 
     def __init__(self, scene: Any, anatomy: Anatomy) -> None:
         """Add the organ at rest."""
         self._scene, self._mesh, self._points = scene, anatomy.mesh, anatomy.mesh.points
-        self._surfaces = {
-            False: organ_surface(anatomy),
-            True: boundary_surface(anatomy, PLAIN_TRIANGLES_MOST),
-        }
-        self.plain = self._drawn_plain = False
-        self._opacity: float | None = None
+        self._surface = organ_surface(anatomy)
         self._shown = anatomy.mesh.points
-        self._add_organ()
+        vertices, _ = self._surface.follow(self._shown)
+        faces = self._surface.faces.astype(np.uint32)
+        self._organ = scene.add_mesh_simple("/organ", _scaled(vertices), faces, color=ORGAN_COLOUR, opacity=None)
         self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(COLOURS)]
         self._painted, self._fresh = -1, 1
         self.paints = True
@@ -194,7 +188,6 @@ class OrganView:
 
     def follow(self, node_position: FloatArray) -> None:
         """Move the surface to the node positions [m], (n_node, 3)."""
-        self._choose_surface()
         if self._fresh == 0 and np.abs(node_position - self._shown).max() < STILL:
             return
         self._fresh, self._shown = 0, node_position
@@ -207,27 +200,8 @@ class OrganView:
         for ball, node in self._lesions:
             node.position = ball.centre_now(self._points, node_position) * SCALE
 
-    def _choose_surface(self) -> None:
-        """Switch between the fine and the plain surface, if `plain` changed."""
-        if self.plain == self._drawn_plain:
-            return
-        self._drawn_plain = self.plain
-        self._add_organ()
-        for paint in self._paint:
-            paint.cover(NO_FACES)
-        self._painted, self._fresh = -1, 1
-
-    def _add_organ(self) -> None:
-        self._surface = self._surfaces[self._drawn_plain]
-        vertices, _ = self._surface.follow(self._shown)
-        faces = self._surface.faces.astype(np.uint32)
-        self._organ = self._scene.add_mesh_simple(
-            "/organ", _scaled(vertices), faces, color=ORGAN_COLOUR, opacity=self._opacity
-        )
-
     def paint(self, felt: FeltMap) -> None:
         """Update the colours of the stiffness map; the softest part is blue."""
-        self._choose_surface()
         if not self.paints or felt.version == self._painted:
             return
         self._painted, self._fresh = felt.version, 1
@@ -254,8 +228,7 @@ class OrganView:
         for _, node in self._lesions:
             node.remove()
         self._lesions = []
-        self._opacity = 0.45 if lesions else None
-        self._organ.opacity = self._opacity
+        self._organ.opacity = 0.45 if lesions else None
         for index, lesion in enumerate(lesions):
             ball = lesion_ball(self._mesh, lesion)
             node = self._scene.add_icosphere(

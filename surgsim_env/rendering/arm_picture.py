@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm
-from surgsim_env.rendering.cameras import Camera, filling
+from surgsim_env.rendering.cameras import filling
 from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
 from surgsim_env.rendering.scene_model import shown_geoms
 
@@ -17,8 +17,6 @@ SIZE, FIELD_OF_VIEW = (1600, 1200), 30.0
 SHARE = 0.94
 # The view is from beside the arm, by these amounts from the trocar's side and from above.
 AHEAD, ABOVE = 0.5, 0.35
-# Places of the shaft that should be seen: from the tip this many times as far as the trocar.
-SHAFT, SHAFT_PLACES = 3.0, 30
 TROCAR_RADIUS, TROCAR_COLOUR = 0.008, (0.95, 0.75, 0.2, 1.0)
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
@@ -37,19 +35,10 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     aside = np.cross(up, arm.trocar - points.mean(axis=0))
     # Of an arm whose middle is above the trocar every side shows as much.
     aside = aside / length if (length := float(np.linalg.norm(aside))) > 1e-6 else arm.port.rotation[:, 1]
-    shaft = tip + np.linspace(0.0, SHAFT, SHAFT_PLACES)[:, None] * (arm.trocar - tip)
-    directions = np.outer((1.0, -1.0), aside) + AHEAD * np.cross(aside, up) + ABOVE * up
-    cameras = [filling(points, one, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE) for one in directions]
-    camera = min(cameras, key=lambda one: _hidden(arm, data, shaft, one))
+    direction = aside + AHEAD * np.cross(aside, up) + ABOVE * up
+    camera = filling(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
     ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
     return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]
-
-
-def _hidden(arm: Arm, data: mujoco.MjData, places: FloatArray, camera: Camera) -> int:
-    """Number of places [m] (n, 3) of the shaft that the arm's other parts hide from a camera."""
-    body, geom = arm.model.body(arm.description.trocar.shaft_body).id, np.zeros(1, dtype=np.int32)
-    rays = [mujoco.mj_ray(arm.model, data, place, camera.position - place, None, 1, body, geom) for place in places]
-    return sum(0.0 <= ray < 1.0 for ray in rays)
 
 
 def _box_corners(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:

@@ -1,7 +1,6 @@
-"""Rendering of an environment by its render_mode: pictures, or a live window turned and zoomed with the mouse."""
+"""Rendering of an environment by its render_mode: pictures, or a live window."""
 
 import ctypes.util
-import math
 import os
 import sys
 import time
@@ -13,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.material.regions import Lesion
-from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering import gl
-from surgsim_env.rendering.cameras import Camera, placed_endoscope
+from surgsim_env.rendering.cameras import placed_endoscope
 from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import CAMERAS, render_options
 from surgsim_env.scene.model import Endoscope
@@ -26,10 +24,6 @@ if TYPE_CHECKING:
     from surgsim_env.rendering.renderer import OrganRenderer
 
 RENDER_MODES = ("human", "rgb_array")
-# Rotation of the view for each pixel of a drag [rad], and factor of the distance for each notch of the wheel.
-TURN, ZOOM = 0.008, 0.9
-# Smallest angle between the view and the vertical [rad].
-POLE = 0.05
 # Keys that a task may read; GLFW's code of a key is that of its letter.
 PLAYING_KEYS = "ADEFQRSW "
 
@@ -83,12 +77,9 @@ class Window:
         """Attach to an open window; a period [s] at least lies between two pictures."""
         self._renderer, self._context, self._period = renderer, context, period
         self._camera_name = renderer.options.camera
-        self._turn, self._zoom = np.zeros(2), 1.0
-        self._cursor: FloatArray | None = None
         self._next = time.monotonic()
         self.closed = False
         glfw, handle = context._glfw, context.handle
-        glfw.set_scroll_callback(handle, lambda _, __, notches: self._wheel(notches))
         glfw.set_key_callback(handle, lambda _, key, __, action, ___: self._key(key, action))
 
     def show(self) -> None:
@@ -100,8 +91,7 @@ class Window:
         if glfw.window_should_close(handle):
             self.close()
             return
-        self._drag()
-        frame = self._renderer.rgb(self._camera())
+        frame = self._renderer.rgb(self._camera_name)
         self._renderer.present(frame)
         self._context.make_current()
         glfw.swap_buffers(handle)
@@ -122,40 +112,12 @@ class Window:
             self._renderer.close()
             self._context.free()
 
-    def _camera(self) -> Camera:
-        around, over = self._turn.tolist()
-        return orbited(self._renderer.cameras[self._camera_name], around, over, self._zoom)
-
-    def _drag(self) -> None:
-        glfw, handle = self._context._glfw, self._context.handle
-        cursor = np.array(glfw.get_cursor_pos(handle))
-        if self._cursor is not None and glfw.get_mouse_button(handle, glfw.MOUSE_BUTTON_LEFT) == glfw.PRESS:
-            self._turn += TURN * (cursor - self._cursor)
-        self._cursor = cursor
-
-    def _wheel(self, notches: float) -> None:
-        self._zoom = float(np.clip(self._zoom * ZOOM**notches, 0.2, 5.0))
-
     def _key(self, key: Any, action: Any) -> None:
         glfw = self._context._glfw
         if action == glfw.PRESS and key == glfw.KEY_C:
             self._camera_name = CAMERAS[(CAMERAS.index(self._camera_name) + 1) % len(CAMERAS)]
-            self._turn, self._zoom = np.zeros(2), 1.0
         if action == glfw.PRESS and key == glfw.KEY_ESCAPE:
             glfw.set_window_should_close(self._context.handle, True)
-
-
-def orbited(camera: Camera, around: float, over: float, zoom: float) -> Camera:
-    """A camera turned about its target: around the upright axis and over it [rad], its distance times `zoom`."""
-    offset, up = camera.position - camera.target, camera.up
-    height = math.asin(float(np.clip(offset @ up / np.linalg.norm(offset), -1.0, 1.0)))
-    level = np.cross(up, camera.rotation[:, 0]) * -1.0
-    side = np.cross(up, level)
-    tilt = float(np.clip(height + over, POLE - 0.5 * math.pi, 0.5 * math.pi - POLE))
-    direction = level * math.cos(around) - side * math.sin(around)
-    raised = direction * math.cos(tilt) + up * math.sin(tilt)
-    distance = zoom * float(np.linalg.norm(offset))
-    return Camera.looking(camera.target + distance * raised, camera.target, up, camera.fov)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,21 +19,6 @@ class NoGLError(RuntimeError):
     """There is no OpenGL; the message says what is missing and how to install it."""
 
 
-def import_mujoco() -> None:
-    """Import MuJoCo, which loads OpenGL at import where MUJOCO_GL is set, and explain a failure.
-
-    Raises:
-        ImportError: names the packages that are missing.
-    """
-    try:
-        importlib.import_module("mujoco")
-    except Exception as error:  # each library raises another error where it is missing
-        kind = os.environ.get(VARIABLE, "").lower().strip()
-        if kind not in MODULES:
-            raise
-        raise ImportError(f"{VARIABLE} is {kind!r}, but there is {no_gl_message(kind, error)}") from error
-
-
 def has_display() -> bool:
     """Whether a window can be opened, by the environment's variables."""
     return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)

@@ -22,7 +22,6 @@ class RenderOptions:
         show_force: draw the tissue's force on each tool as an arrow with its size in newtons; none where it is 0.
         show_lesion: the organ is translucent and its lesions are solid inside.
         cut_away: the organ is cut open through its first lesion (without one, through its palpable face).
-        shadows: the lamp casts true shadows, from the instrument too; twice as long a picture without a graphics card.
         smooth_edges: four samples for each pixel; without it pictures take half the time.
 
     Raises:
@@ -35,18 +34,14 @@ class RenderOptions:
     show_force: bool = True
     show_lesion: bool = False
     cut_away: bool = False
-    shadows: bool = False
     smooth_edges: bool = True
 
     def __post_init__(self) -> None:
         check_camera(self.camera)
         for name in ("width", "height"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= PIXELS_MOST:
+            if not isinstance(value, int) or not 1 <= value <= PIXELS_MOST:
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of pixels from 1 to {PIXELS_MOST}")
-        for name in ("show_force", "show_lesion", "cut_away", "shadows", "smooth_edges"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} is {getattr(self, name)!r}; it must be True or False")
 
 
 def check_camera(camera: str) -> None:

@@ -76,13 +76,10 @@ class DrawnMesh:
         self._model = model
         self.mesh = model.mesh(name).id
         self.geom = model.geom(name).id
-        self._room = int(model.mesh_vertnum[self.mesh]), int(model.mesh_facenum[self.mesh])
-        self._face_count = self._room[1]
-        assert model.mesh_normalnum[self.mesh] == self._room[0]
+        self._face_count = int(model.mesh_facenum[self.mesh])
 
     def upload(self, shape: Shape, context: mujoco.MjrContext) -> None:
         """Replace the shape of the mesh; the geom's frame is the world's."""
-        assert len(shape.vertices) <= self._room[0] and len(shape.faces) <= self._room[1]
         model, mesh, count = self._model, self.mesh, len(shape.vertices)
         for array, address, values in (
             (model.mesh_vert, model.mesh_vertadr, shape.vertices),
@@ -148,7 +145,7 @@ def build_scene(
 ) -> SceneModel:
     """The scene of an anatomy and an instrument's model, with room for the meshes that the options need."""
     spec = empty_scene(options.width, options.height, BACKGROUND_COLOUR, samples=4 if options.smooth_edges else 0)
-    light = add_lights(spec, anatomy.downward, shadows=options.shadows)
+    light = add_lights(spec, anatomy.downward)
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
@@ -237,13 +234,13 @@ def _room(
         # A tet is cut in a quadrangle at most; its triangles are split, and a lesion's outline may divide each of them.
         small = 2 * SECTION_SPLITS**2 * most_tets_cut(anatomy.mesh, cut_direction(anatomy))
         room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
-    elif not (options.shadows or options.show_lesion or anatomy.scene.supports):
+    elif not (options.show_lesion or anatomy.scene.supports):
         # An organ on supports does not lie on the drape and casts no shadow on it.
         room["shadow"] = (anatomy.mesh.node_count, len(anatomy.mesh.boundary_triangles))
     return room
 
 
-def add_lights(spec: mujoco.MjSpec, down: FloatArray, *, shadows: bool = False) -> FloatArray:
+def add_lights(spec: mujoco.MjSpec, down: FloatArray) -> FloatArray:
     """A lamp above the surgeon's left shoulder, a faint one from behind, one at the camera; the lamp's direction."""
     up = -down
     across, along = tangent_axes(down)
@@ -252,7 +249,7 @@ def add_lights(spec: mujoco.MjSpec, down: FloatArray, *, shadows: bool = False) 
         light = spec.worldbody.add_light(name=name, dir=towards / np.linalg.norm(towards))
         light.pos = -0.8 * np.asarray(light.dir)
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-        light.castshadow = shadows and name == "lamp"
+        light.castshadow = False
         light.diffuse, light.specular, light.ambient = [strength] * 3, [strength] * 3, [0.0] * 3
     head = spec.visual.headlight
     head.ambient, head.diffuse, head.specular = [0.30] * 3, [0.36] * 3, [0.10] * 3

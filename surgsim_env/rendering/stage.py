@@ -29,7 +29,6 @@ from surgsim_env.tasks.visibility import Disc
 
 # One thread draws at a time.
 LOCK = threading.RLock()
-SHADOW_MAP = 2048
 # Labels of pixels.
 LABELS = {"background": 0, "organ": 1, "instrument": 2, "lesion": 3, "target": 4}
 # Labels of the scene's meshes.
@@ -52,9 +51,7 @@ class Canvas:
         drawn: the geoms of the current picture
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, gl_context: Any, *, more_geoms: int = 0, shadows: bool = False
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, gl_context: Any, *, more_geoms: int = 0) -> None:
         """Load a model; pictures are as large as its off-screen buffer and may have `more_geoms` than it.
 
         Raises:
@@ -62,7 +59,7 @@ class Canvas:
         """
         self.gl_context = gl_context
         self._model, self._data = model, data
-        model.vis.quality.shadowsize = SHADOW_MAP if shadows else 0
+        model.vis.quality.shadowsize = 0
         gl_context.make_current()
         try:
             self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -70,7 +67,7 @@ class Canvas:
             raise gl.NoGLError(f"OpenGL is there, but MuJoCo cannot draw with it: {error}") from error
         self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self.drawn = mujoco.MjvScene(model, model.ngeom + more_geoms)
-        self.drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self.drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self.drawn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
@@ -147,9 +144,7 @@ class Stage:
         most = min(TRIANGLES_MOST, options.width * options.height // PIXELS_OF_TRIANGLE)
         self.surface = boundary_surface(anatomy, most) if options.cut_away else organ_surface(anatomy, most)
         self.scene = build_scene(anatomy, self.surface, instrument, options)
-        self.canvas = Canvas(
-            self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1, shadows=options.shadows
-        )
+        self.canvas = Canvas(self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1)
         self._look = DrawnLook(self.scene, self.canvas.context, has_vessels=not options.cut_away)
         # Labels of geoms that a picture has beyond those of the model, by their places in it.
         self._added: dict[int, int] = {}

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +14,7 @@ from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
+from surgsim_env.haptics.trajectory import TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.tasks.task import Task
 
@@ -218,6 +220,63 @@ class MoveTo(_Checked):
             share = float(norm(velocity) / norm(gap))
             view = yield view.action(velocity, turning=left * share)
             left = left * (1.0 - share * view.control_step)
+
+
+@dataclass(frozen=True)
+class Follow(_Checked):
+    """Move the tip along a recording's path at its pace: of the tip that `surgsim view` recorded, or time, x, y, z [m].
+
+    It goes to the path's beginning first. It fails where the tip is farther than `tolerance` [m] from where it was at
+    that time, such as on a path faster than `speed` [m/s]. In a pause the tip goes on as recorded; buttons do nothing.
+    """
+
+    path: Path
+    arm: int = 1  # of a recording of two: 1 or 2
+    speed: float = 0.02
+    tolerance: float = 0.005
+    timeout: float = 600.0
+    name: str = ""
+
+    def actions(self, view: View) -> Plan:
+        """To the first place, then each control step to where the tip was at its end.
+
+        Raises:
+            ValueError: a file that is no recording and no trajectory; names the line.
+        """
+        time, places = _recorded_path(Path(self.path), "" if self.arm == 1 else f"_{self.arm}")
+        view = yield from _all_of(MoveTo(tuple(places[0].tolist()), self.speed), view)
+        begun = view.time
+        while (now := view.time - begun) < time[-1]:
+            there = np.array([np.interp(now, time, column) for column in places.T])
+            if (missed := float(norm(there - view.tip_position))) > self.tolerance:
+                raise StepFailed(f"was {missed * 1e3:.1f} mm from the path of {self.path.name} at {now:.2f} s of it")
+            ahead = np.array([np.interp(now + view.control_step, time, column) for column in places.T])
+            way = ahead - view.tip_position
+            distance = float(norm(way))
+            pace = min(self.speed, distance / view.control_step)
+            view = yield view.action(way * (pace / distance) if distance > 0.0 else np.zeros(3))
+
+
+def _recorded_path(path: Path, mark: str) -> tuple[FloatArray, FloatArray]:
+    """Times from 0 [s] (n,) and places [m] (n, 3) of a tip that was recorded, else of a hand without pauses."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        of_tip = f"{TIP}x{mark}" in file.readline().strip().split(",")
+    motion = read_motion(path, mark, of_tip=of_tip)
+    known = np.isfinite(motion.position).all(axis=1)
+    time, places = motion.time[known], motion.position[known]
+    return time - time[0], places
+
+
+def _all_of(step: "Step", view: View) -> Generator[Action, View, View]:
+    """The actions of a step within another one; returns the last view."""
+    plan = step.actions(view)
+    try:
+        action = next(plan)
+        while True:
+            view = yield action
+            action = plan.send(view)
+    except StopIteration:
+        return view
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.scene.model import Port
 from tests.arm_study.pivot_arm import RADIUS, SITE, TABLE, pivot, pivot_excess, write_pivot
 from tests.instruments.joints import random_joints
-from tests.instruments.psm_table import PSM_LINKS, shaft_depth
+from tests.instruments.psm_table import PSM_LINKS
 
 DOWN = (0.0, 0.0, -1.0)
 

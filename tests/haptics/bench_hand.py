@@ -1,6 +1,8 @@
 """A simulated hand that presses a small phantom through a coupling: what several tests and the figure run."""
 
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -9,17 +11,16 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.coupling import VirtualCoupling
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings, WatchdogTimes
-from surgsim_env.haptics.simulated import Hand, SimulatedDevice
+from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
+from tests.haptics.simulated import Hand, SimulatedDevice
 
 DT = 1e-3
 # The tip half a millimetre above the middle of the phantom's top.
 START = np.array([0.02, 0.02, 0.0285])
 # So that neither clamp nor slew nor the gentle start hides an oscillation.
-UNLIMITED = ForceLimits(force_largest=15.0, slew_largest=1e5)
-AT_ONCE = WatchdogTimes(resume=DT)
+UNLIMITED = HapticSettings(force_largest=15.0, slew_largest=1e5, resume=DT, smoothing=0.0)
 
 
 @cache
@@ -36,7 +37,7 @@ def touching_simulation(place: FloatArray = START) -> Simulation:
 
 
 def bare_settings(stiffness: float, damping: float = 0.0) -> HapticSettings:
-    return HapticSettings(VirtualCoupling(stiffness, damping), UNLIMITED, AT_ONCE, smoothing=0.0)
+    return replace(UNLIMITED, coupling=VirtualCoupling(stiffness, damping))
 
 
 class UndeclaredDevice(SimulatedDevice):
@@ -58,3 +59,8 @@ def run(loop: HapticLoop, device: SimulatedDevice, count: int):
     for _ in range(count):
         yield loop.step()
         device.advance()
+
+
+def save_trajectory(path: Path, time: FloatArray, position: FloatArray) -> None:
+    """A file of times [s], (n,), and places [m], (n, 3), with all digits."""
+    np.savetxt(path, np.column_stack([time, position]), fmt="%.17g", delimiter=",", header="time,x,y,z", comments="")

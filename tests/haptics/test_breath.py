@@ -9,12 +9,12 @@ import pytest
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.settings import BREATH_BIT, HapticSettings
-from surgsim_env.haptics.simulated import Hand
 from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion
 from tests.haptics.bench_hand import DT, START, held_device, run
+from tests.haptics.simulated import Hand
 
 # Towards the tip, so that a breath is a deeper press [m].
 RISE = 0.002
@@ -102,7 +102,7 @@ def test_a_button_holds_the_breath_while_it_is_pressed(anatomy):
     place[2] = np.nan
     for button in (BREATH_BIT, None):
         simulation.reset(anatomy.organ(), START)
-        device = TrajectoryDevice(0.01 * np.arange(4), place, pressed, recorded=True)
+        device = TrajectoryDevice(0.01 * np.arange(4), place, pressed)
         loop = HapticLoop(simulation, device, HapticSettings(breath_button=button))
         held = []
         for _ in range(40):
@@ -114,10 +114,3 @@ def test_a_button_holds_the_breath_while_it_is_pressed(anatomy):
     loop.reset()
     loop.step()
     assert simulation.holds_breath
-
-
-def test_one_button_does_not_close_a_jaw_and_hold_the_breath():
-    with pytest.raises(ValueError, match="are both 1; set one to another bit"):
-        HapticSettings(jaw_button=1, breath_button=1)
-    with pytest.raises(ValueError, match="breath_button is 32"):
-        HapticSettings(breath_button=32)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings, WatchdogTimes
+from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.udp import UdpDevice
 from tests.haptics.bench_hand import DT, touching_simulation
 
@@ -42,7 +42,7 @@ def test_the_bridge_feels_the_press():
     exec(compile(BRIDGE, "docs/haptics.md", "exec"), names)
     names["time"] = turns = Turns()
     device = UdpDevice(clock=turns.monotonic)
-    loop = HapticLoop(touching_simulation(), device, HapticSettings(relative=True, watchdog=WatchdogTimes(resume=0.01)))
+    loop = HapticLoop(touching_simulation(), device, HapticSettings(relative=True, resume=0.01))
     felt: list[tuple] = []
     way = iter(np.linspace(0.0, 0.006, 600))
     turns.step = lambda: loop.step().fault

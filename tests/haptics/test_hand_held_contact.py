@@ -8,8 +8,7 @@ import pytest
 from surgsim_env.haptics.coupling import coupling_for, stiffness_limit
 from surgsim_env.haptics.device import DeviceDynamics
 from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import ForceLimits, HapticSettings
-from surgsim_env.haptics.simulated import Hand, SimulatedDevice
+from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.haptics.tip_drive import tip_drives
 from tests.haptics.bench_hand import (
     DT,
@@ -20,6 +19,7 @@ from tests.haptics.bench_hand import (
     run,
     touching_simulation,
 )
+from tests.haptics.simulated import Hand, SimulatedDevice
 
 # What rounding may give back of some millijoules [J].
 ROUNDING = 1e-12
@@ -172,7 +172,7 @@ def test_clamped_coupling_takes_energy_too():
     """A hand of 2 N against a coupling held at 1 N: a spring that gives way gives no energy either."""
     simulation = touching_simulation()
     device = held_device(hand=Hand(stiffness=200.0, damping=2.0), path=lambda time: START - [0, 0, min(0.02, time)])
-    settings = replace(bare_settings(400.0, 0.125), limits=ForceLimits(force_largest=1.0, slew_largest=1e5))
+    settings = replace(bare_settings(400.0, 0.125), force_largest=1.0)
     loop = HapticLoop(simulation, device, settings)
     for told in run(loop, device, 1500):
         assert np.linalg.norm(told.tip.force) <= 1.0 + 1e-12
@@ -216,5 +216,5 @@ def test_contact_as_shipped_gives_at_most_what_the_spring_holds():
 @pytest.mark.slow
 def test_a_slew_limit_that_always_acts_gives_more():
     """The bound of the test above can be missed."""
-    held, _, bound = tapped_with_a_cut(HapticSettings(limits=ForceLimits(slew_largest=0.5)))
+    held, _, bound = tapped_with_a_cut(HapticSettings(slew_largest=0.5))
     assert held.min() < -10.0 * bound

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from surgsim_env.haptics.loop import HapticLoop
 from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.trajectory import TrajectoryDevice, save_trajectory
-from tests.haptics.bench_hand import START, touching_simulation
+from surgsim_env.haptics.trajectory import TrajectoryDevice
+from tests.haptics.bench_hand import START, save_trajectory, touching_simulation
 
 
 def test_plays_linearly_between_rows_and_holds_the_last():

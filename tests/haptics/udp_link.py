@@ -4,9 +4,7 @@ import socket
 import threading
 import time
 
-import numpy as np
-
-from surgsim_env.haptics.udp import PosePacket, UdpDevice, pack_pose
+from surgsim_env.haptics.udp import KIND_FORCE, KIND_POSE, MAGIC, PACKET, VERSION, UdpDevice
 
 # How long anything may take before a test gives up [s]. Nothing that passes depends on it.
 SECONDS = 600.0
@@ -52,6 +50,18 @@ class SharedTime:
             self._changed.notify_all()
 
 
+def packed(kind: int, sequence: int, sent: float, vector, buttons: int = 0) -> bytes:
+    """A pose or a force as it travels."""
+    return PACKET.pack(MAGIC, VERSION, kind, buttons, sequence, sent, *vector)
+
+
+def force_of(answer: bytes) -> tuple[int, float, tuple]:
+    """Sequence, time and force of an answer."""
+    magic, version, kind, zero, sequence, sent, *force = PACKET.unpack(answer)
+    assert (magic, version, kind, zero) == (MAGIC, VERSION, KIND_FORCE, 0)
+    return sequence, sent, tuple(force)
+
+
 class Sender:
     """A bridge's socket; loopback delivers at once, so that an answer is there when the device has written it."""
 
@@ -61,8 +71,8 @@ class Sender:
         self.socket.connect(device.address)
         self.socket.settimeout(SECONDS)
 
-    def pose(self, sequence: int, place=(0.0, 0.0, 0.0), **rest) -> None:
-        self.raw(pack_pose(PosePacket(sequence, 1.5, np.array(place), **rest)))
+    def pose(self, sequence: int, place=(0.0, 0.0, 0.0), buttons: int = 0) -> None:
+        self.raw(packed(KIND_POSE, sequence, 1.5, place, buttons))
 
     def raw(self, data: bytes) -> None:
         self.socket.send(data)

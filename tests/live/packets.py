@@ -2,11 +2,7 @@
 
 import struct
 
-from surgsim_env.live.messages import DrawingReport, HandMotion
-
-
-def write_report(report: DrawingReport) -> bytes:
-    return struct.pack("<fHH", report.rate or 0.0, report.rate is not None, report.software)
+from surgsim_env.live.messages import HandMotion
 
 
 def write_hand(motion: HandMotion) -> bytes:

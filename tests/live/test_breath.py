@@ -7,12 +7,11 @@ import pytest
 
 from msdm_core.organ.motion import SIGNAL
 from msdm_core.organ.support import Support
-from surgsim_env.live.exchange_records import TRACE_STEPS, Record, Replay, Reset
-from surgsim_env.live.recording import read_recording, write_recording
+from surgsim_env.live.exchange_records import TRACE_STEPS, Reset
 from surgsim_env.live.session import BREATH_BUTTON
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion, Scene
-from tests.live.test_physics import ASIDE, Bench
+from tests.live.test_physics import Bench
 
 RISE = 0.003
 BREATH = CyclicMotion(
@@ -53,50 +52,6 @@ def test_the_switch_holds_the_breath_and_the_heart_goes_on(bench):
     assert not breath.any()
     breath, _ = signals(bench, 200, bench.above).T
     assert breath.max() > 0.5 and not bench.frame["breath_held"]
-
-
-@pytest.mark.parametrize("held_before", [0, BREATH_BUTTON])
-def test_a_replay_of_a_breathing_patient_repeats_every_bit(bench, held_before):
-    """The switch is recorded: turned before the recording, in its middle, with its first step."""
-    bench.step(700, bench.above, held_before)
-    bench.ask(Record(True))
-    for count, place, buttons in (
-        (150, bench.pressed, BREATH_BUTTON - held_before),
-        (50, None, 0),
-        (400, bench.pressed + 0.003 * ASIDE, held_before),
-    ):
-        bench.step(count, place, buttons)
-    bench.ask(Record(False))
-    steps = bench.exchange.recorded.steps.copy()
-    assert len(steps) == 600 and np.linalg.norm(steps["force"], axis=2).max() > 0.02
-    node, held = bench.frame["node"].copy(), bool(bench.frame["breath_held"])
-    # Meanwhile the patient does something else, and the page's switch stands as it does not in the recording's end.
-    bench.step(333, bench.above, BREATH_BUTTON - held_before)
-    bench.ask(Replay(True))
-    forces = []
-    for _ in range(600):
-        bench.step(1)
-        forces.append(bench.frame["force"][0].copy())
-    assert np.array_equal(np.array(forces), steps["force"][:, 0])
-    assert np.array_equal(bench.frame["node"], node)
-    # From here on the page's switch holds again.
-    assert bench.frame["breath_held"] == held == bool(held_before)
-    bench.step(2, bench.above, BREATH_BUTTON - held_before)
-    assert bench.frame["breath_held"] == (not held)
-
-
-def test_a_recorded_file_is_played_to_the_breaths_that_it_was_recorded_in(bench, tmp_path):
-    bench.step(200, bench.above)
-    bench.ask(Record(True))
-    recorded = np.concatenate(
-        [signals(bench, 300, bench.above), signals(bench, 300, bench.above, BREATH_BUTTON)], axis=0
-    )
-    bench.ask(Record(False))
-    assert "600 steps" in write_recording(bench.exchange.recorded.steps.copy(), tmp_path)
-    bench.exchange.recorded.fill(read_recording(tmp_path / "recording-1.csv", 1, bench.scene.timing.haptic_step))
-    bench.step(77, bench.above)
-    bench.ask(Replay(True, given=True))
-    np.testing.assert_allclose(signals(bench, 600, None), recorded, atol=1e-12)
 
 
 def test_supports_are_drawn_where_the_ground_carries_them_and_other_parts_are_not():

@@ -4,29 +4,15 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from surgsim_env.cli import main as cli
-from surgsim_env.cli.view import missed_targets
-from surgsim_env.haptics.pacing import Timeliness
 from surgsim_env.live.exchange_records import LiveError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-KEPT = Timeliness(
-    steps=1000,
-    skipped=0,
-    rate=1000.0,
-    real_time=1.0,
-    late_p50=1e-4,
-    late_p99=1e-3,
-    late_most=3e-3,
-    spent_p50=3e-4,
-    spent_p99=5e-4,
-)
 # A recording begins by itself once the page is served; time begins to pass for `--seconds` when it has some steps.
 CHILD = """
 import math
@@ -63,9 +49,7 @@ def hear_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.parametrize(
-    ("how", "code"), [pytest.param(signal.SIGTERM, 0, marks=pytest.mark.slow), (signal.SIGINT, 130), (None, 0)]
-)
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (None, 0)])
 def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
     script, out = tmp_path / "view.py", tmp_path / "out"
     script.write_text(CHILD)
@@ -81,10 +65,7 @@ def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
     assert [path.name for path in out.iterdir()] == ["recording-1.csv"]
     assert "out: " in told and "steps written to recording-1.csv" in told
     table = np.genfromtxt(out / "recording-1.csv", delimiter=",", names=True)
-    # Steps in which the page gave no place have no row.
-    steps = np.diff(table["time"]) / 1e-3
-    assert len(table) > 100 and (steps.round() >= 1).all() and np.allclose(steps, steps.round(), atol=1e-3)
-    assert all(np.isfinite(table[name]).all() for name in table.dtype.names)
+    assert len(table) > 100 and np.allclose(np.diff(table["time"]), 1e-3, atol=1e-6)
 
 
 def test_a_session_that_fails_is_said_in_one_line(monkeypatch, capsys):
@@ -100,18 +81,3 @@ def test_a_motion_that_is_unknown_is_said_in_one_line(capsys):
     assert cli.main(["view", "--scene", "phantom_small", "--motion", "clam"]) == 2
     words = "motion 'clam' is unknown; the motions are none, calm, free; did you mean 'calm'?"
     assert capsys.readouterr().err == f"surgsim: error: {words}\n"
-
-
-@pytest.mark.parametrize(
-    ("kept", "updates", "force", "told"),
-    [
-        (KEPT, 30.0, 0.2, None),
-        (replace(KEPT, rate=994.0), 30.0, 0.2, "994.0 steps/s of 1000"),
-        (replace(KEPT, late_p99=0.002), 30.0, 0.2, "late by up to 2.00 ms"),
-        (KEPT, 19.9, 0.2, "19.9 updates/s"),
-        (KEPT, 30.0, 0.0, "no force"),
-    ],
-)
-def test_targets_that_are_missed_are_named(kept, updates, force, told):
-    missed = missed_targets(kept, 1e-3, updates, force)
-    assert missed == [] if told is None else len(missed) == 1 and told in missed[0]

@@ -62,14 +62,3 @@ def test_touches_paint_it_where_they_were_felt_and_nowhere_else(anatomy, view):
     nodes = anatomy.mesh.points[felt.nodes[felt.felt]]
     reach = np.linalg.norm(nodes - top, axis=1).max()
     assert np.linalg.norm(painted - top, axis=1).max() < reach + 0.001
-
-
-def test_plain_pictures_draw_the_boundary_of_the_tets(anatomy, view):
-    organ, sent = view
-    before = len(sent.meshes["/organ"].faces)
-    organ.plain = True
-    organ.follow(anatomy.mesh.points)
-    assert len(sent.meshes["/organ"].faces) < before
-    organ.plain = False
-    organ.follow(anatomy.mesh.points)
-    assert len(sent.meshes["/organ"].faces) == before

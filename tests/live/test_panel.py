@@ -13,7 +13,7 @@ from surgsim_env.live.panel import PLOT_LEAST, PLOTTED, Panel
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.motions import with_motion
 
-BUTTONS = {"Pause": "pause", "Reset": "reset", "Record": "record", "Replay": "replay", "Clear": "clear_map"}
+BUTTONS = {"Pause": "pause", "Reset": "reset", "Record": "record", "Clear": "clear_map"}
 SWITCHES = {
     "Close the jaw": "close_jaw",
     "Hold the breath": "hold_breath",
@@ -140,23 +140,21 @@ def test_only_what_there_is_can_be_switched():
 
 def test_buttons_are_named_by_what_a_click_does():
     panel, gui, _ = made(make_scene("phantom_small"))
-    pause, record, replay = (gui.elements[name] for name in ("Pause", "Record", "Replay"))
+    pause, record = (gui.elements[name] for name in ("Pause", "Record"))
     frame = new_exchange(1, 4, 1).frame.read()
-    for phase, recording, replaying, names in (
-        (Phase.RUNNING, False, False, ("Pause", "Record", "Replay (2.0 s)")),
-        (Phase.PAUSED, False, False, ("Continue", "Record", "Replay (2.0 s)")),
-        (Phase.RUNNING, True, False, ("Pause", "End recording (2 s)", "Replay (2.0 s)")),
-        (Phase.RUNNING, False, True, ("Pause", "Record", "End replay")),
+    for phase, recording, names in (
+        (Phase.RUNNING, False, ("Pause", "Record")),
+        (Phase.PAUSED, False, ("Continue", "Record")),
+        (Phase.RUNNING, True, ("Pause", "End recording (2 s)")),
     ):
-        frame["phase"], frame["recording"], frame["replaying"] = phase, recording, replaying
+        frame["phase"], frame["recording"] = phase, recording
         panel.show_phase(frame, 2.0, jaw_closed=True, breath_held=True)
-        assert (pause.label, record.label, replay.label) == names
-        assert replay.disabled == recording
+        assert (pause.label, record.label) == names
     assert gui.elements["Close the jaw"].value and gui.elements["Hold the breath"].value
     panel.show_phase(frame, 0.0, jaw_closed=False, breath_held=False)
-    assert replay.disabled and not gui.elements["Close the jaw"].value
+    assert not gui.elements["Close the jaw"].value
     panel.show_status(frame, [("force", "0.25 N")])
-    assert "replaying" in gui.texts[0].content and "0.25 N" in gui.texts[0].content
+    assert "recording" in gui.texts[0].content and "0.25 N" in gui.texts[0].content
     panel.show_plain(True)
     assert gui.elements["Plain light"].value
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from surgsim_env.rendering.cameras import Camera, filling, scene_cameras
-from surgsim_env.rendering.episode_view import orbited
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, scene_from_table
@@ -89,17 +88,3 @@ def test_scene_may_place_the_endoscope():
     assert camera.fov == 45.0
     pixels, _ = camera.project(np.array([place["target"]]), 640, 480)
     np.testing.assert_allclose(pixels, [[320.0, 240.0]], atol=1e-9)
-
-
-def test_dragging_turns_about_the_target(anatomy):
-    """No drag is no change; a quarter turn keeps height and distance; up stays up."""
-    camera = scene_cameras(anatomy)["overview"]
-    np.testing.assert_allclose(orbited(camera, 0.0, 0.0, 1.0).position, camera.position, atol=1e-12)
-    turned = orbited(camera, 0.5 * math.pi, 0.0, 2.0)
-    offset, before = turned.position - camera.target, camera.position - camera.target
-    assert np.linalg.norm(offset) == pytest.approx(2.0 * np.linalg.norm(before))
-    assert offset @ camera.up == pytest.approx(2.0 * (before @ camera.up))
-    level, level_before = offset - offset @ camera.up * camera.up, before - before @ camera.up * camera.up
-    assert abs(level @ level_before) < 1e-9
-    lifted = orbited(camera, 0.0, 10.0, 1.0).position - camera.target
-    assert lifted @ camera.up / np.linalg.norm(lifted) == pytest.approx(math.cos(0.05))

@@ -10,6 +10,7 @@ import surgsim_env  # noqa: F401
 from surgsim_env.scripting import (
     Control,
     Declare,
+    Follow,
     Hold,
     Lift,
     MoveTo,
@@ -206,3 +207,22 @@ def test_a_controller_of_ones_own_sees_each_observation_and_acts():
     until = run_script(env, [Control(pusher, timeout=2.0, until=lambda view: view.true_force[2] > 0.05)])
     assert pusher.observations[0].tobytes() == first.tobytes()
     assert until.duration < 1.0 and until.force[-1, 2] > 0.05
+
+
+def recorded(path, trace, *, pause=slice(0, 0)):
+    """A trace's tip as `surgsim view` would record it, with a hand that is somewhere else and lets go for a while."""
+    rows = np.column_stack([trace.haptic_time, np.zeros((len(trace.haptic_time), 4)), trace.tip_position])
+    rows = np.delete(rows, pause, axis=0)
+    np.savetxt(path, rows, delimiter=",", header="time,x,y,z,buttons,tip_x,tip_y,tip_z", comments="", fmt="%.9g")
+    return path
+
+
+@pytest.mark.parametrize("pause", [slice(0, 0), slice(300, 420)], ids=["whole", "paused"])
+def test_a_recording_is_followed(tmp_path, pause):
+    first = run_script(above(), [PressUntil(0.2, max_depth=0.008), Hold(0.5)])
+    again = run_script(above(gap=0.003), [Follow(recorded(tmp_path / "r.csv", first, pause=pause)), Hold(0.3)])
+    played = again.between("Follow")
+    # The tip ends where it was recorded, at that pace, and feels the same: 0.1 mm is 0.01 N here.
+    np.testing.assert_allclose(again.tip_position[-1], first.tip_position[-1], atol=1e-4)
+    assert again.force[-1, 2] == pytest.approx(first.force[-1, 2], abs=0.015)
+    assert played.duration > first.haptic_time[-1] - first.haptic_time[0]

@@ -194,6 +194,3 @@ def test_another_organ_comes_into_a_lane():
         pass
     both.assert_same()
     assert both.wrench[:, 0, 2].all()
-    with pytest.raises(OrganError, match="surface_count of the lanes' organs and of their states differ"):
-        put_lane(both.state, 2, rest_state(drawn(5), shape_count=1))
-        next(both.press(1))

@@ -240,7 +240,7 @@ LaneModel = namedtuple(
         *("surface_count", "support_count", "anchor_count"),
     ),
 )
-LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units; tets are shared, the lane is the last index.
+LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units; tets are shared.
 
 Fields are those of OrganModel, and `lanes`: as many zeros as there are lanes, so that their number is part of the
 compiled type. Each lane has its own node_mass, node_inverse_mass, spring_stiffness, node_softness, tet_bulk,

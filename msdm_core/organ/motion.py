@@ -119,11 +119,6 @@ def place_on_ground(model: OrganModel, state: OrganState, signal: ArrayLike, rat
     state.node_velocity[:] += (state.motion[:, RATE, None, None] * shift).sum(axis=0)
 
 
-def ground_work(state: OrganState) -> FloatArray:
-    """Work that each motion of the ground has done on the organ [J], shape (n_motion,)."""
-    return state.motion[:, WORK].copy()
-
-
 def foundation_places(model: OrganModel, state: OrganState) -> FloatArray:
     """Where the organ's foundations hold their nodes now [m], shape (n_held, 3)."""
     return model.foundation_position + (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msdm_core.arithmetic import matmul
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.material.regions import Damping, Material
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import momentum, support_forces
+from msdm_core.organ.measure import support_forces
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance, advance_organ, describe_fault, round_shapes
 from msdm_core.organ.support import Support, SupportLaw
@@ -327,7 +328,7 @@ def slid(tilt: float, friction: float) -> tuple[float, float]:
     start = model.node_mass @ state.node_position
     run(model, state, seconds, dt)
     path = (model.node_mass @ state.node_position - start) @ down / mass
-    speed = momentum(model, state) @ down / mass
+    speed = matmul(model.node_mass, state.node_velocity) @ down / mass
     return float(2.0 * path / seconds**2), float(speed / seconds)
 
 

@@ -124,7 +124,7 @@ def test_the_organ_sees_the_twist_that_mujoco_ends_with():
 def test_contact_energy_is_the_oracles(engaged: int):
     """A ball and a capsule in a deformed block, held points counted where the surface has turned past the shape.
 
-    The guard's share is the oracle's for a ball; a shaft's nearest point is the kernel's, so its axis stays outside.
+    No axis is so near that the guard pushes: its energy is the oracle's alone.
     """
     model = oracle.block()
     state = oracle.deformed_state(model, 5, shape_count=2)

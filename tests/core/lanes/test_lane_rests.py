@@ -24,11 +24,12 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.foundation import Foundation
-from msdm_core.organ.motion import Motion, ground_work, steer
+from msdm_core.organ.motion import Motion, steer
 from msdm_core.organ.stepping import advance_organ
 from msdm_core.organ.support import Support, SupportLaw
 from tests.core import oracle
 from tests.core.lanes.test_lanes import DAMPED, LAW, SUBSTEP, SUBSTEPS, same, varied
+from tests.core.measures import ground_work
 
 SIZE, CELLS = (0.03, 0.02, 0.02), (6, 4, 4)
 DOWN = (0.0, 0.0, -9.81)

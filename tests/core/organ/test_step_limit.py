@@ -12,7 +12,6 @@ from msdm_core.material.regions import Damping, Material
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import internal_forces
 from msdm_core.organ.stability import (
     apply_stiffness,
     contact_excess,
@@ -23,6 +22,7 @@ from msdm_core.organ.stability import (
 )
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from tests.core import oracle
+from tests.core.measures import internal_forces
 
 
 def run_unchecked(model: OrganModel, state: OrganState, dt: float, count: int) -> int:

@@ -9,12 +9,13 @@ from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, Cont
 from msdm_core.lanes.lanes import advance_lanes, get_lane, rest_lanes, stack_organs, stack_shapes
 from msdm_core.organ import compile as organ_compile
 from msdm_core.organ.compile import rest_state
-from msdm_core.organ.measure import kinetic_energy, momentum, potential_energy, support_forces
+from msdm_core.organ.measure import kinetic_energy, potential_energy, support_forces
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance, advance_organ
 from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.validation.friction import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
 from tests.core import oracle
+from tests.core.measures import momentum
 from tests.core.organ.test_stable_step import growth
 
 

@@ -26,7 +26,7 @@ from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax
 from msdm_core.organ.measure import kinetic_energy, potential_energy, spring_energies, spring_tensions
 from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ, round_shapes
-from tests.core.measures import angular_momentum, internal_forces
+from tests.core.measures import angular_momentum, arm_energy, internal_forces
 
 LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)
 ARMS = Relaxation(relative_moduli=(0.3, 0.2, 0.4), times=(0.05, 0.5, 5.0))

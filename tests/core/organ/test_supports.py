@@ -257,7 +257,7 @@ def test_lanes_rest_as_their_organs_do_alone():
 
 
 def test_a_state_of_other_supports_is_refused():
-    with pytest.raises(OrganError, match=r"memory of supports .*0, 0, 3"):
+    with pytest.raises(OrganError, match="memory of contact points, nodes on supports"):
         advance(free_block(FLOOR), rest_state(free_block(gravity=(0.0, 0.0, 0.0))), dt=1e-5)
 
 

@@ -115,8 +115,8 @@ def _check_state(model: OrganModel, state: OrganState, shape_count: int) -> None
     memory = (state.contact_engaged.shape[1], *state.support_stretch.shape[:2], len(state.motion))
     if (len(state.node_position), *memory) != organ or shape_count > len(state.contact_engaged):
         raise OrganError(
-            f"the state has {len(state.node_position)} nodes, memory of contact points, nodes on supports, supports and "
-            f"motions {memory} and {len(state.contact_engaged)} shapes, the organ {organ[0]}, {organ[1:]} and "
+            f"the state has {len(state.node_position)} nodes, memory of contact points, nodes on supports, supports "
+            f"and motions {memory} and {len(state.contact_engaged)} shapes, the organ {organ[0]}, {organ[1:]} and "
             f"{shape_count}: make the state with rest_state(model, shape_count=...)"
         )
 

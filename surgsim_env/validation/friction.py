@@ -251,9 +251,9 @@ def slip(strip: HangingStrip, gravity: float) -> tuple[float, float]:
     raise ValueError(f"the strip never slipped, up to {gravity * mass:.3f} N")
 
 
-def grasped_strip(gravity: float = 8.5) -> Iterator[Row]:
+def grasped_strip() -> Iterator[Row]:
     """Hung on its jaw: reaction against weight, strain against F / (E A), and the load at which it slips."""
-    strip = gripped_strip()
+    strip, gravity = gripped_strip(), 8.5
     resting = strip.gauge_length
     wrench = strip.run(0.6, gravity=gravity)
     yield compare(

@@ -1,11 +1,11 @@
-"""Quantities of the state of an organ that tests alone compare: momentum, forces, energy of Maxwell arms, work."""
+"""Quantities of an organ that tests alone compare: momentum, forces, energy and loss of Maxwell arms, work."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.material.tissue_law import ARM_COUNT
+from msdm_core.material.tissue_law import ARM_COUNT, Relaxation
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import _node_rises, node_strains, spring_energies
 from msdm_core.organ.motion import WORK
@@ -97,3 +97,13 @@ def _lengths_of(model: OrganModel, tension: FloatArray) -> FloatArray:
     raise ValueError(
         f"no lengths were found for the tensions that the arms have given way to, in {LENGTH_ROUNDS} rounds"
     )
+
+
+def loss_tangent(arms: Relaxation, frequency: float) -> float:
+    """Loss over storage modulus of the springs at a frequency [Hz].
+
+    G* = 1 + sum g_i (i w tau_i) / (1 + i w tau_i), w = 2 pi f.
+    """
+    turn = 2.0j * np.pi * frequency * np.asarray(arms.times)
+    modulus = 1.0 + np.sum(np.asarray(arms.relative_moduli) * turn / (1.0 + turn))
+    return float(modulus.imag / modulus.real)

@@ -94,6 +94,22 @@ def advance(
             f"dt is {dt:g} s; it must be above 0 and at most the stable step{with_contact} {limit:.4g} s: "
             "use more, shorter substeps"
         )
+    return advance_or_raise(model, state, dt, substep_count, shapes, contact)
+
+
+def advance_or_raise(
+    model: OrganModel,
+    state: OrganState,
+    dt: float,
+    substep_count: int,
+    shapes: ContactShapes = NO_SHAPES,
+    contact: ContactLaw = NO_CONTACT,
+) -> FloatArray:
+    """`advance` without the checks of its arguments.
+
+    Raises:
+        OrganDivergedError: a fault.
+    """
     wrench = np.zeros((len(shapes.tool_centre), 6))
     fault = advance_organ(model, state, shapes, contact, dt, substep_count, wrench)
     if fault != FAULT_NONE:

@@ -74,9 +74,7 @@ def layer_mesh(radius: float, depth: float, fine: float, reach: tuple[float, flo
 class PressedLayer:
     """A bonded layer of modulus E(r, z) [Pa] under a ball, quadratic elements at finite strain."""
 
-    def __init__(
-        self, mesh: Any, modulus: Modulus, poisson_ratio: float, *, membrane: float = 0.0
-    ) -> None:
+    def __init__(self, mesh: Any, modulus: Modulus, poisson_ratio: float, *, membrane: float = 0.0) -> None:
         """Make the layer at rest.
 
         Args:

@@ -7,14 +7,14 @@ import numpy as np
 
 from msdm_core.arithmetic import matmul
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT
-from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.material.regions import Damping, Material
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import support_forces
 from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import advance, advance_organ, describe_fault, round_shapes
+from msdm_core.organ.stepping import advance, advance_or_raise, round_shapes
 from msdm_core.organ.support import Support, SupportLaw
 from surgsim_env.validation.row import Row, compare
 from surgsim_env.validation.touch import BallOnOrgan, ball, block
@@ -175,7 +175,7 @@ class HangingStrip:
             turning: of both about x, around their middle [rad/s].
 
         Raises:
-            ValueError: the simulation of the strip ended with a fault.
+            OrganDivergedError: the simulation of the strip ended with a fault.
         """
         pull = -gravity * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
         pull.setflags(write=False)
@@ -187,9 +187,7 @@ class HangingStrip:
             arm = self.pads.tool_centre - self.pads.tool_centre.mean(axis=0)
             self.pads.tool_twist[:, :3] += np.cross([turning, 0.0, 0.0], arm)
         for _ in range(round(duration / (5 * self.dt))):
-            fault = advance_organ(model, self.state, self.pads, LAW, self.dt, 5, wrench)
-            if fault != FAULT_NONE:
-                raise ValueError(describe_fault(model, self.state, fault))
+            wrench = advance_or_raise(model, self.state, self.dt, 5, self.pads, LAW)
         return wrench
 
     def height(self, level: float) -> float:

@@ -2,8 +2,8 @@
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.linalg import cg
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Damping, Lesion, Material
@@ -92,9 +92,7 @@ def solve_displacement(
     if load is not None:
         right += load[free]
     inner = csr_array(stiffness[free][:, free])
-    inverse = 1.0 / np.asarray(inner.diagonal(), dtype=np.float64)
-    # scipy's stubs lack the factory form of LinearOperator.
-    jacobi = LinearOperator(inner.shape, matvec=lambda x: inverse * x, dtype=np.float64)  # pyright: ignore[reportCallIssue]
+    jacobi = diags_array(1.0 / np.asarray(inner.diagonal(), dtype=np.float64))
     found, code = cg(inner, right, rtol=RESIDUAL, maxiter=20000, M=jacobi)
     if code != 0:
         raise ValueError(f"the linear solution did not converge in {code} iterations")

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csc_array
 
-from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.material.continuum import (
     SpringSolid,
     bar_gradient,
@@ -25,7 +25,7 @@ from msdm_core.material.regions import Damping, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, rest_state
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
+from msdm_core.organ.stepping import advance_or_raise
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.validation.elements import BallContact
@@ -176,9 +176,7 @@ def all_directions() -> Iterator[Result]:
 def advanced(model: OrganModel, state: OrganState, duration: float) -> None:
     """Advance an organ that nothing touches by some time [s]."""
     count = int(np.ceil(duration / (0.9 * model.stable_step)))
-    fault = advance_organ(model, state, NO_SHAPES, NO_CONTACT, duration / count, count, np.zeros((0, 6)))
-    if fault != FAULT_NONE:
-        raise ValueError(describe_fault(model, state, fault))
+    advance_or_raise(model, state, duration / count, count)
 
 
 def step_strain(arms: Relaxation, stiffening: Stiffening | None = None) -> Iterator[Row]:

@@ -15,7 +15,7 @@ from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_vo
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.support_kernels import add_support_forces, place_ground
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from msdm_core.organ.motion import foundation_places
+from msdm_core.organ.motion import SIGNAL
 
 # Of strains, as a margin.
 ROUNDING = 1e-12
@@ -50,7 +50,8 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
     volume += 0.5 * float(matmul(model.node_bulk * model.node_rest_volume, np.square(averaged - 1.0)))
     lift = matmul(state.node_position - model.node_rest_position, model.gravity)
-    moved = state.node_position[model.foundation_nodes] - foundation_places(model, state)
+    ground = (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)
+    moved = state.node_position[model.foundation_nodes] - (model.foundation_position + ground)
     held = 0.5 * float((dot(model.foundation_stiffness, moved[:, None]) * moved).sum())
     return springs + volume + held - float(matmul(model.node_mass, lift))
 

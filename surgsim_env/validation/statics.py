@@ -57,7 +57,7 @@ def volume_gradient(points: FloatArray, tets: NDArray[np.int32]) -> FloatArray:
 
 def averaged_gradient(tets: NDArray[np.int32], gradient: FloatArray, count: int) -> csr_array:
     """dV/dx of the volume averaged at each node [m^2], (n_node, 3 n_node)."""
-    columns = (3 * tets[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(tets), -1)
+    columns = node_rows(tets)
     rows = np.repeat(tets, columns.shape[1], axis=1)
     values, places = np.tile(gradient / 4.0, (1, 4)), np.tile(columns, (1, 4))
     return coo_array((values.ravel(), (rows.ravel(), places.ravel())), shape=(count // 3, count)).tocsr()
@@ -65,11 +65,19 @@ def averaged_gradient(tets: NDArray[np.int32], gradient: FloatArray, count: int)
 
 def outer_products(nodes: NDArray[np.int32], vectors: FloatArray, count: int) -> csr_array:
     """Sum of v v^T over items with the given nodes, v listing three components a node."""
-    places = (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
-    width = places.shape[1]
-    values = vectors[:, :, None] * vectors[:, None, :]
-    rows, columns = np.repeat(places, width, axis=1), np.tile(places, (1, width))
-    return coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(count, count)).tocsr()
+    return block_sum(vectors[:, :, None] * vectors[:, None, :], node_rows(nodes), count).tocsr()
+
+
+def block_sum(blocks: FloatArray, rows: NDArray[np.int64], count: int) -> coo_array:
+    """Sum of the matrices of items (n, m, m) at their rows (n, m), (count, count)."""
+    width = rows.shape[1]
+    left, right = np.repeat(rows, width, axis=1), np.tile(rows, (1, width))
+    return coo_array((blocks.ravel(), (left.ravel(), right.ravel())), shape=(count, count))
+
+
+def node_rows(nodes: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Rows of the displacement of the nodes of items, (n, 3 m) for nodes (n, m)."""
+    return (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
 
 
 def nodal_dofs(nodes: ArrayLike, axes: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.int64]:

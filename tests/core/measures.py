@@ -8,7 +8,7 @@ from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.material.tissue_law import ARM_COUNT, Relaxation
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import _node_rises, node_strains, spring_energies
-from msdm_core.organ.motion import WORK
+from msdm_core.organ.motion import RATE, SIGNAL, WORK
 
 
 def momentum(model: OrganModel, state: OrganState) -> FloatArray:
@@ -107,3 +107,8 @@ def loss_tangent(arms: Relaxation, frequency: float) -> float:
     turn = 2.0j * np.pi * frequency * np.asarray(arms.times)
     modulus = 1.0 + np.sum(np.asarray(arms.relative_moduli) * turn / (1.0 + turn))
     return float(modulus.imag / modulus.real)
+
+
+def steer(state: OrganState, signal: ArrayLike, duration: float) -> None:
+    """Let each motion's signal change evenly to a value (n_motion,) over the next `duration` [s] of steps."""
+    state.motion[:, RATE] = (np.asarray(signal, dtype=np.float64) - state.motion[:, SIGNAL]) / duration

@@ -9,15 +9,7 @@ from msdm_core.errors import OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS, STRAIN_LEAST, node_law
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
-from msdm_core.lanes.lanes import (
-    advance_lanes,
-    get_lane,
-    lane_responses,
-    lanes_of,
-    put_lane,
-    stack_organs,
-    stack_shapes,
-)
+from msdm_core.lanes.lanes import get_lane, lane_responses, lanes_of, put_lane, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Lesion, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -26,6 +18,7 @@ from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax
 from msdm_core.organ.measure import kinetic_energy, potential_energy, spring_energies, spring_tensions
 from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ, round_shapes
+from tests.core.lanes.abreast import advance_lanes
 from tests.core.measures import angular_momentum, arm_energy, internal_forces
 
 LIVER = Stiffening(onset_strain=0.03, cap_strain=0.12, tangent_cap=20.0)

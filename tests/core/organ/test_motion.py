@@ -13,11 +13,11 @@ from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.foundation import Foundation
 from msdm_core.organ.measure import kinetic_energy, potential_energy, support_forces
-from msdm_core.organ.motion import Motion, place_on_ground, steer
+from msdm_core.organ.motion import Motion, place_on_ground
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ
 from msdm_core.organ.support import Support
-from tests.core.measures import ground_work
+from tests.core.measures import ground_work, steer
 
 SIZE = (0.06, 0.03, 0.03)
 MESH = box_mesh(SIZE, (6, 3, 3))

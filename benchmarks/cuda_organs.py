@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import cuda
 
-from msdm_core.cuda.organs import KEPT, OWN, DeviceOrgans
+from msdm_core.cuda.organs import DeviceOrgans
 from msdm_core.kernels.structure_kernels import ContactShapes, ToolResponse
 from msdm_core.lanes.lanes import stack_shapes
 from msdm_core.organ.compile import rest_state
@@ -56,22 +56,6 @@ def alone(anatomy: Anatomy, organ: Any, path: int, dt: float, count: int) -> np.
     return wrench[0, :3]
 
 
-def fill(device: DeviceOrgans, organs: list[Any]) -> None:
-    """Put the organs at rest into all lanes in turn."""
-    lanes = range(device.lane_count)
-    for name in OWN:
-        rows = np.stack([getattr(organs[lane % len(organs)], name) for lane in lanes])
-        getattr(device.model, name).copy_to_device(rows.astype(device.dtype))
-    rest = rest_state(organs[0], shape_count=2)
-    for name in KEPT:
-        array = getattr(device.state, name)
-        array.copy_to_device(
-            np.ascontiguousarray(np.broadcast_to(getattr(rest, name).astype(array.dtype), array.shape))
-        )
-    device.state.volume_ratio_smallest.copy_to_device(np.ones(device.lane_count, device.dtype))
-    device.state.fault.copy_to_device(np.zeros(device.lane_count, np.int32))
-
-
 def measure(name: str, lanes: int, options: dict[str, Any], steps: int) -> dict[str, Any]:
     """Press, compare four lanes, then time launches with the tips at rest in the tissue."""
     anatomy = load_anatomy(make_scene(name))
@@ -80,7 +64,7 @@ def measure(name: str, lanes: int, options: dict[str, Any], steps: int) -> dict[
     dt = timing.haptic_step / timing.substep_count
     shapes = [probe(anatomy, path) for path in range(min(lanes, PATHS))]
     device = DeviceOrgans(organs[0], lanes, shapes[0], anatomy.scene.contact.law, dt, timing.substep_count, **options)
-    fill(device, organs)
+    device.put(organs, [rest_state(organ, shape_count=2) for organ in organs])
     still = ToolResponse(*(np.stack([array] * lanes) for array in unyielding(1)))
     device.put_tools(stack_shapes([shapes[lane % PATHS] for lane in range(lanes)], lanes), still)
     begin = time.perf_counter()

@@ -38,6 +38,7 @@ from msdm_core.kernels.contact_kernels import (
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     corner_gradient,
+    edge,
     node_tension,
     spring_length,
     spring_scale,
@@ -209,10 +210,6 @@ def _wait(grid):
         grid.sync()
 
 
-def _edge(position, a, b):
-    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
-
-
 # ---- tissue -------------------------------------------------------------------------------------------------------
 
 
@@ -221,7 +218,7 @@ def _set_volumes(first, stride, model, work):
     for tet in range(first, model.tet_nodes.shape[0], stride):
         a, b = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1]
         c, d = model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
-        _, six = tet_shape(_edge(work.position, a, b), _edge(work.position, a, c), _edge(work.position, a, d))
+        _, six = tet_shape(edge(work.position, a, b), edge(work.position, a, c), edge(work.position, a, d))
         work.tet[tet] = six
 
 
@@ -251,7 +248,7 @@ def _set_scales(first, stride, model, lane, work, flags, lowest):
         )  # fmt: skip
         work.tet[tet] = tet_scale(ratio, model.tet_bulk[lane, tet], model.tet_averaged_bulk[lane, tet], averaged)
     for spring in range(first, model.spring_nodes.shape[0], stride):
-        x, y, z = _edge(work.position, model.spring_nodes[spring, 0], model.spring_nodes[spring, 1])
+        x, y, z = edge(work.position, model.spring_nodes[spring, 0], model.spring_nodes[spring, 1])
         share = model.spring_rest_length[spring] / spring_length(x, y, z)
         work.spring[spring] = spring_scale(share, model.spring_stiffness[lane, spring])
     return lowest
@@ -266,14 +263,14 @@ def _set_forces(first, stride, model, lane, work):
             p = model.node_tets[slot, node, 1]
             # At any corner the gradient is the product of two edges of the face opposite.
             g = corner_gradient(
-                _edge(position, p, model.node_tets[slot, node, 2]), _edge(position, p, model.node_tets[slot, node, 3])
+                edge(position, p, model.node_tets[slot, node, 2]), edge(position, p, model.node_tets[slot, node, 3])
             )
             scale = work.tet[model.node_tets[slot, node, 0]]
             fx += scale * g[0]
             fy += scale * g[1]
             fz += scale * g[2]
         for slot in range(model.node_spring_count[node]):
-            x, y, z = _edge(position, node, model.node_springs[slot, node, 1])
+            x, y, z = edge(position, node, model.node_springs[slot, node, 1])
             scale = work.spring[model.node_springs[slot, node, 0]]
             fx += scale * x
             fy += scale * y
@@ -564,7 +561,7 @@ def _hold_squeezed(model, lane, work, dt, block, scratch):
 
 def _is_squeezed(model, work, tet):
     a, b, c, d = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1], model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
-    _, six = tet_shape(_edge(work.position, a, b), _edge(work.position, a, c), _edge(work.position, a, d))
+    _, six = tet_shape(edge(work.position, a, b), edge(work.position, a, c), edge(work.position, a, d))
     return volume_ratio(six, model.tet_inverse_volume[tet]) < SQUEEZED_RATIO
 
 
@@ -727,48 +724,3 @@ def advance_organ(model, state, scratch, tools, law, numbers):
             cuda.cg.this_grid(), cuda.blockIdx.x == 0, cuda.grid(1), cuda.gridsize(1), model, 0, scratch.pool[0],
             state, tools, law, numbers, 0, scratch, shared[: 6 * cuda.blockDim.x],
         )  # fmt: skip
-
-
-# ---- what a control step shows ------------------------------------------------------------------------------------
-
-
-def look(model, state, rest_position, centre, inverted):
-    """Of each organ the area and the centre of its contact patch at rest, and whether a tet is inverted now.
-
-    Out: centre: area [m^2], and area times place [m^3] (n_lane, 4), inverted (n_lane,)
-    """
-    block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
-    shared = cuda.shared.array(0, REAL_TYPE)[: 4 * threads]
-    sums = shared.reshape((4, shared.shape[0] // 4))
-    for lane in range(block, state.fault.shape[0], cuda.gridDim.x):
-        if thread == 0:
-            inverted[lane] = 0
-        for part in range(4):
-            sums[part, thread] = 0.0
-        cuda.syncthreads()
-        position = state.node_position[lane]
-        for tet in range(thread, model.tet_nodes.shape[0], threads):
-            a, b = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1]
-            c, d = model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
-            _, six = tet_shape(_edge(position, a, b), _edge(position, a, c), _edge(position, a, d))
-            if not six > 0.0:
-                inverted[lane] = 1
-        for item in range(thread, QUADRATURE_COUNT * model.surface_triangles.shape[0], threads):
-            held = False
-            for shape in range(state.contact_engaged.shape[1]):
-                if state.contact_engaged[lane, shape, item] != 0:
-                    held = True
-            if held:
-                triangle, point = item // QUADRATURE_COUNT, item % QUADRATURE_COUNT
-                area = model.surface_rest_area[triangle]
-                sums[0, thread] += area
-                for corner in range(3):
-                    node = model.surface_triangles[triangle, corner]
-                    weight = area * QUADRATURE_BARYCENTRIC[point, corner]
-                    for axis in range(3):
-                        sums[1 + axis, thread] += weight * rest_position[node, axis]
-        _add_up(sums)
-        if thread == 0:
-            for part in range(4):
-                centre[lane, part] = sums[part, 0]
-        cuda.syncthreads()

@@ -1,5 +1,6 @@
 """Organs of one mesh side by side on a CUDA device: their arrays there, and the calls that advance them."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from msdm_core.cuda.organ_steps import (
     Tools,
     advance_lanes,
     advance_organ,
-    look,
     working_size,
 )
 from msdm_core.errors import OrganError
@@ -31,7 +31,6 @@ from msdm_core.kernels.structure_kernels import (
     OrganModel,
     OrganState,
 )
-from msdm_core.organ.compile import rest_state
 
 # Fields of a model that each lane has of its own.
 OWN = ("node_mass", "node_inverse_mass", "node_bulk", "spring_stiffness", "tet_bulk", "tet_averaged_bulk")
@@ -259,29 +258,25 @@ class DeviceOrgans:
         """
         check_device()
         check_organ(organ)
-        self.organ, self.dtype, self.threads = organ, np.dtype(dtype).type, threads
+        self.dtype, self.threads = np.dtype(dtype).type, threads
         real = self.dtype
         nodes, tets, springs = len(organ.node_mass), len(organ.tet_nodes), len(organ.spring_nodes)
-        self._shape_count = len(shapes.shape_radius)
         size = np.dtype(real).itemsize
-        self._room = working_size(nodes, tets, springs)
+        room = working_size(nodes, tets, springs)
         sums = 6 * threads * size
         limit = shared_memory()
-        self.is_shared = lane_count > 1 and sums + self._room * size <= limit
-        self.shared_bytes = sums + (self._room * size if self.is_shared else 0)
+        self.is_shared = lane_count > 1 and sums + room * size <= limit
+        self.shared_bytes = sums + (room * size if self.is_shared else 0)
         if block_count is None:
             block_count = multiprocessors() * (max(1, limit // (self.shared_bytes + 1024)) if lane_count > 1 else 1)
         self.block_count = min(block_count, lane_count) if lane_count > 1 else block_count
         blocks = self.block_count if lane_count > 1 else 1
 
         arrays = DeviceArrays.of(
-            organ, lane_count, shapes, real, blocks=blocks, threads=threads, room=1 if self.is_shared else self._room
+            organ, lane_count, shapes, real, blocks=blocks, threads=threads, room=1 if self.is_shared else room
         )
         self.model, self.state = _on_device(arrays.model), _on_device(arrays.state)
         self.scratch, self.tools = _on_device(arrays.scratch), _on_device(arrays.tools)
-        self.centre = cuda.to_device(np.zeros((lane_count, 4), dtype=real))
-        self.inverted = cuda.to_device(np.zeros(lane_count, dtype=np.int32))
-        self._rest = cuda.to_device(organ.node_rest_position.astype(real))
         self.law = ContactLaw(*(real(value) for value in contact))
         self._numbers = (real(dt), real(exp(-organ.alpha * dt)), substep_count)
         self.lane_count = lane_count
@@ -290,30 +285,21 @@ class DeviceOrgans:
         self._kernel = functions.kernel(
             advance_organ if lane_count == 1 else advance_lanes, registers or min(255, REGISTERS // threads)
         )
-        self._look = functions.kernel(look)
 
-    def put(self, lane: int, organ: OrganModel, state: OrganState | None = None) -> None:
-        """Put an organ of the same mesh into a lane, in a state; at rest by default."""
-        if state is None:
-            state = rest_state(organ, shape_count=self._shape_count)
+    def put(self, organs: Sequence[OrganModel], states: Sequence[OrganState]) -> None:
+        """Put organs of the same mesh with their states into all lanes, in turn where there are fewer than lanes."""
+        lanes = np.arange(self.lane_count) % len(organs)
         for name in OWN:
-            self._write(getattr(self.model, name), lane, getattr(organ, name))
+            self._write(getattr(self.model, name), np.stack([getattr(organ, name) for organ in organs])[lanes])
         for name in KEPT:
-            self._write(getattr(self.state, name), lane, getattr(state, name))
-        self._write(self.state.volume_ratio_smallest, slice(lane, lane + 1), state.volume_ratio_smallest)
-        self._write(self.state.fault, slice(lane, lane + 1), np.array([FAULT_NONE]))
+            self._write(getattr(self.state, name), np.stack([getattr(state, name) for state in states])[lanes])
+        lowest = np.concatenate([state.volume_ratio_smallest for state in states])
+        self._write(self.state.volume_ratio_smallest, lowest[lanes])
+        self._write(self.state.fault, np.full(self.lane_count, FAULT_NONE))
 
     @staticmethod
-    def _write(array: Any, place: Any, values: NDArray) -> None:
-        array[place].copy_to_device(np.ascontiguousarray(values.astype(array.dtype)))
-
-    def get(self, lane: int, state: OrganState) -> OrganState:
-        """The state of a lane as that of an organ alone; `state` has its arrays."""
-        read = {name: getattr(self.state, name)[lane].copy_to_host() for name in KEPT}
-        read = {name: array.astype(getattr(state, name).dtype) for name, array in read.items()}
-        lowest = self.state.volume_ratio_smallest.copy_to_host()[lane : lane + 1].astype(np.float64)
-        fault = self.state.fault.copy_to_host()[lane : lane + 1]
-        return state._replace(**read, volume_ratio_smallest=lowest, lane_fault=fault)
+    def _write(array: Any, values: NDArray) -> None:
+        array.copy_to_device(np.ascontiguousarray(values.astype(array.dtype)))
 
     def put_tools(self, lane_shapes: ContactShapes, response: Any) -> None:
         """Where the tools of all lanes are, and how they yield: as of `advance_lanes`, the lane as first index."""
@@ -326,7 +312,7 @@ class DeviceOrgans:
             "mobility": response.tool_mobility,
         }
         for name, values in pairs.items():
-            getattr(self.tools, name).copy_to_device(values.astype(self.dtype))
+            self._write(getattr(self.tools, name), values)
 
     def advance(self, step_count: int = 1) -> None:
         """Advance all lanes that have no fault by some haptic steps; returns before they are done."""
@@ -338,9 +324,3 @@ class DeviceOrgans:
         if self._ready is None:
             self._ready = with_shared_memory(self._kernel, given, self.shared_bytes)
         self._ready[self.block_count, self.threads, 0, self.shared_bytes](*given)
-
-    def look(self) -> None:
-        """Compute `centre` and `inverted` of all lanes."""
-        shared = 4 * self.threads * np.dtype(self.dtype).itemsize
-        blocks = min(self.lane_count, 4 * multiprocessors())
-        self._look[blocks, self.threads, 0, shared](self.model, self.state, self._rest, self.centre, self.inverted)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
+from msdm_core.kernels.element_kernels import corner_gradient, edge
 from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 
 # Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
@@ -156,11 +157,10 @@ def facet_of(position, surface, triangle):
     a = surface[triangle, 0]
     b = surface[triangle, 1]
     c = surface[triangle, 2]
-    bx, by, bz = _span(position, a, b)
-    cx, cy, cz = _span(position, a, c)
-    nx = by * cz - bz * cy
-    ny = bz * cx - bx * cz
-    nz = bx * cy - by * cx
+    b_edge, c_edge = edge(position, a, b), edge(position, a, c)
+    bx, by, bz = b_edge
+    cx, cy, cz = c_edge
+    nx, ny, nz = corner_gradient(b_edge, c_edge)
     twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx /= twice_area
     ny /= twice_area
@@ -230,7 +230,7 @@ def press_point(
     uy = stretch_memory[shape, item, 1]
     uz = stretch_memory[shape, item, 2]
     vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
-    ox, oy, oz = _tool_velocity(twist, centre, tool, x, y, z)
+    ox, oy, oz = tool_velocity(twist, centre, tool, x, y, z)
     vx += twist[tool, 4] * uz - twist[tool, 5] * uy - ox
     vy += twist[tool, 5] * ux - twist[tool, 3] * uz - oy
     vz += twist[tool, 3] * uy - twist[tool, 4] * ux - oz
@@ -359,7 +359,7 @@ def begin_hold(position, shapes, rows, places, number):
     for corner in range(3):
         node = places[number, 2 + corner]
         weight = QUADRATURE_BARYCENTRIC[point, corner]
-        ox, oy, oz = _tool_velocity(twist, centre, tool, position[node, 0], position[node, 1], position[node, 2])
+        ox, oy, oz = tool_velocity(twist, centre, tool, position[node, 0], position[node, 1], position[node, 2])
         slope = ROW_SLOPE + 3 * corner
         rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
         vx += weight * ox
@@ -523,12 +523,6 @@ def _overlap(position, axis, a, b, c, low, high):
 
 
 @njit(**INLINED)
-def _span(position, a, b):
-    """From one node to another [m]."""
-    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
-
-
-@njit(**INLINED)
 def _mean(values, a, b, c, wa, wb, wc):
     """Three nodes' values by their weights."""
     x = wa * values[a, 0] + wb * values[b, 0] + wc * values[c, 0]
@@ -538,7 +532,7 @@ def _mean(values, a, b, c, wa, wb, wc):
 
 
 @njit(**INLINED)
-def _tool_velocity(twist, centre, tool, x, y, z):
+def tool_velocity(twist, centre, tool, x, y, z):
     """Velocity of a tool at a point [m/s]."""
     ox = x - centre[tool, 0]
     oy = y - centre[tool, 1]
@@ -645,15 +639,21 @@ def _push_corner(position, force, reference, wrench, tool, node, rows, number, c
     force[node, 0] += fx
     force[node, 1] += fy
     force[node, 2] += fz
-    ax = position[node, 0] - reference[tool, 0]
-    ay = position[node, 1] - reference[tool, 1]
-    az = position[node, 2] - reference[tool, 2]
+    react(wrench, reference, tool, position[node, 0], position[node, 1], position[node, 2], fx, fy, fz)
+
+
+@njit(**INLINED)
+def react(wrench, reference, tool, x, y, z, fx, fy, fz):
+    """Take a force on the tissue at a point, and its torque about the reference, from the wrench on a tool."""
+    x -= reference[tool, 0]
+    y -= reference[tool, 1]
+    z -= reference[tool, 2]
     wrench[tool, 0] -= fx
     wrench[tool, 1] -= fy
     wrench[tool, 2] -= fz
-    wrench[tool, 3] -= ay * fz - az * fy
-    wrench[tool, 4] -= az * fx - ax * fz
-    wrench[tool, 5] -= ax * fy - ay * fx
+    wrench[tool, 3] -= y * fz - z * fy
+    wrench[tool, 4] -= z * fx - x * fz
+    wrench[tool, 5] -= x * fy - y * fx
 
 
 @njit(**INLINED)

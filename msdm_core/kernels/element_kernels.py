@@ -22,6 +22,12 @@ STRAIN_LEAST = 1e-30
 
 
 @njit(**INLINED)
+def edge(position, a, b):
+    """From one node to another, of positions (n_node, 3) [m]."""
+    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
+
+
+@njit(**INLINED)
 def spring_length(dx, dy, dz):
     """Length of a spring [m]; d: from one end to the other [m]."""
     return root(dx * dx + dy * dy + dz * dz)

@@ -109,9 +109,6 @@ def _define_read(corners: int, width: int, result: Any, write: Callable[..., Any
 
     @intrinsic
     def read(_typing: Any, values: Any, items: Any, first: Any) -> Any:
-        if not values.layout == items.layout == "C":
-            return None
-
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
             group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
             written = write(builder, _Numbers(group, context, signature.args[0], given[0], width))
@@ -130,9 +127,6 @@ def _define_add(corners: int, width: int, write: Callable[..., None]) -> Any:
 
     @intrinsic
     def add(_typing: Any, values: Any, items: Any, first: Any, vectors: Any) -> Any:
-        if not values.layout == items.layout == "C":
-            return None
-
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
             group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
             numbers = _Numbers(group, context, signature.args[0], given[0], width)

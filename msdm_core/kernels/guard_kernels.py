@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from numba import njit
 
-from msdm_core.kernels.contact_kernels import closest_on_axis
+from msdm_core.kernels.contact_kernels import closest_on_axis, react, tool_velocity
+from msdm_core.kernels.element_kernels import corner_gradient, edge
 from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 
 # The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
@@ -98,15 +99,10 @@ def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, wat
     c = surface[triangle, 2]
     none = radius * 0.0
     far = _NearPoint((a, b, c), (none, none, none), (none, none, none), (none, none, none), none, none, none)
-    bx = position[b, 0] - position[a, 0]
-    by = position[b, 1] - position[a, 1]
-    bz = position[b, 2] - position[a, 2]
-    cx = position[c, 0] - position[a, 0]
-    cy = position[c, 1] - position[a, 1]
-    cz = position[c, 2] - position[a, 2]
-    nx = by * cz - bz * cy
-    ny = bz * cx - bx * cz
-    nz = bx * cy - by * cx
+    b_edge, c_edge = edge(position, a, b), edge(position, a, c)
+    bx, by, bz = b_edge
+    cx, cy, cz = c_edge
+    nx, ny, nz = corner_gradient(b_edge, c_edge)
     twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
     first = 0.0
     second = 0.0
@@ -156,11 +152,8 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
     ox = x - centre[tool, 0]
     oy = y - centre[tool, 1]
     oz = z - centre[tool, 2]
-    speed = -(
-        ex * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
-        + ey * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
-        + ez * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
-    )
+    vx, vy, vz = tool_velocity(twist, centre, tool, x, y, z)
+    speed = -(ex * vx + ey * vy + ez * vz)
     lever = (ex, ey, ez, oy * ez - oz * ey, oz * ex - ox * ez, ox * ey - oy * ex)
     give = 0.0
     for row in range(6):
@@ -187,22 +180,13 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
         force[node, 0] += weight * fx
         force[node, 1] += weight * fy
         force[node, 2] += weight * fz
-    x -= reference[tool, 0]
-    y -= reference[tool, 1]
-    z -= reference[tool, 2]
-    wrench[tool, 0] -= fx
-    wrench[tool, 1] -= fy
-    wrench[tool, 2] -= fz
-    wrench[tool, 3] -= y * fz - z * fy
-    wrench[tool, 4] -= z * fx - x * fz
-    wrench[tool, 5] -= x * fy - y * fx
+    react(wrench, reference, tool, x, y, z, fx, fy, fz)
 
 
 @njit(**INNER)
 def _passed(shapes, shape, position, velocity, dt, a, b, c):
     """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
     ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
-    ux, uy, uz, wx, wy, wz = twist[tool]
     highest, highest_b, highest_c = 0.0, 0.0, 0.0
     lowest, lowest_b, lowest_c = 0.0, 0.0, 0.0
     for end in range(2):
@@ -210,12 +194,10 @@ def _passed(shapes, shape, position, velocity, dt, a, b, c):
         y = ends[shape, end, 1]
         z = ends[shape, end, 2]
         now, now_b, now_c = _foot(x, y, z, position, velocity, 0.0, a, b, c)
-        ox = x - centre[tool, 0]
-        oy = y - centre[tool, 1]
-        oz = z - centre[tool, 2]
-        x -= dt * (ux + wy * oz - wz * oy)
-        y -= dt * (uy + wz * ox - wx * oz)
-        z -= dt * (uz + wx * oy - wy * ox)
+        vx, vy, vz = tool_velocity(twist, centre, tool, x, y, z)
+        x -= dt * vx
+        y -= dt * vy
+        z -= dt * vz
         then, then_b, then_c = _foot(x, y, z, position, velocity, dt, a, b, c)
         if then > 0.0 >= now and _is_inside(then, then_b, then_c, now, now_b, now_c):
             return True
@@ -241,9 +223,7 @@ def _foot(x, y, z, position, velocity, dt, a, b, c):
     px = x - ax
     py = y - ay
     pz = z - az
-    nx = by * cz - bz * cy
-    ny = bz * cx - bx * cz
-    nz = bx * cy - by * cx
+    nx, ny, nz = corner_gradient((bx, by, bz), (cx, cy, cz))
     squared = nx * nx + ny * ny + nz * nz
     wb = ((py * cz - pz * cy) * nx + (pz * cx - px * cz) * ny + (px * cy - py * cx) * nz) / squared
     wc = ((by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz) / squared

@@ -97,12 +97,6 @@ def store_column(lanes, values, width, item, column, value):
 
 
 @njit(**INLINED)
-def add_to_column(lanes, values, width, item, column, value):
-    """Add to what `load_column` reads."""
-    store_column(lanes, values, width, item, column, load_column(lanes, values, width, item, column) + value)
-
-
-@njit(**INLINED)
 def parts_of(lanes):
     """How many registers hold a node's x, y and z."""
     if len(lanes) == 0:

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from msdm_core.kernels.element_kernels import corner_gradient, edge
 from msdm_core.kernels.option_kernels import KERNEL
 
 
@@ -22,9 +23,7 @@ def multiply_stiffness(
     for spring in range(nodes.shape[0]):
         i = np.uint32(nodes[spring, 0])
         j = np.uint32(nodes[spring, 1])
-        dx = rest[j, 0] - rest[i, 0]
-        dy = rest[j, 1] - rest[i, 1]
-        dz = rest[j, 2] - rest[i, 2]
+        dx, dy, dz = edge(rest, i, j)
         stretch = (
             dx * (displacement[j, 0] - displacement[i, 0])
             + dy * (displacement[j, 1] - displacement[i, 1])
@@ -81,10 +80,5 @@ def _corner_gradient(position, tets, tet, corner):
     a = np.uint32(tets[tet, 0])
     p = np.uint32(tets[tet, 1 + corner % 3])
     q = np.uint32(tets[tet, 1 + (corner + 1) % 3])
-    px = position[p, 0] - position[a, 0]
-    py = position[p, 1] - position[a, 1]
-    pz = position[p, 2] - position[a, 2]
-    qx = position[q, 0] - position[a, 0]
-    qy = position[q, 1] - position[a, 1]
-    qz = position[q, 2] - position[a, 2]
-    return (py * qz - pz * qy) / 6.0, (pz * qx - px * qz) / 6.0, (px * qy - py * qx) / 6.0
+    x, y, z = corner_gradient(edge(position, a, p), edge(position, a, q))
+    return x / 6.0, y / 6.0, z / 6.0

@@ -14,6 +14,7 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
     closest_on_core,
 )
+from msdm_core.kernels.element_kernels import corner_gradient, edge, tet_shape
 from msdm_core.kernels.option_kernels import KERNEL
 
 
@@ -34,13 +35,10 @@ def add_pressures(model, state, shapes, stiffness, push):
                 continue
             triangle, point = item // QUADRATURE_COUNT, item % QUADRATURE_COUNT
             a, b, c = surface[triangle, 0], surface[triangle, 1], surface[triangle, 2]
-            bx = position[b, 0] - position[a, 0]
-            by = position[b, 1] - position[a, 1]
-            bz = position[b, 2] - position[a, 2]
-            cx = position[c, 0] - position[a, 0]
-            cy = position[c, 1] - position[a, 1]
-            cz = position[c, 2] - position[a, 2]
-            nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+            b_edge, c_edge = edge(position, a, b), edge(position, a, c)
+            bx, by, bz = b_edge
+            cx, cy, cz = c_edge
+            nx, ny, nz = corner_gradient(b_edge, c_edge)
             size = math.sqrt(nx * nx + ny * ny + nz * nz)
             wb, wc = QUADRATURE_BARYCENTRIC[point, 1], QUADRATURE_BARYCENTRIC[point, 2]
             x = position[a, 0] + wb * bx + wc * cx
@@ -67,20 +65,16 @@ def add_gradients(rest, position, tets, gradient):
     """
     for tet in range(tets.shape[0]):
         i, j, k, m = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
-        ax, ay, az = rest[j, 0] - rest[i, 0], rest[j, 1] - rest[i, 1], rest[j, 2] - rest[i, 2]
-        bx, by, bz = rest[k, 0] - rest[i, 0], rest[k, 1] - rest[i, 1], rest[k, 2] - rest[i, 2]
-        cx, cy, cz = rest[m, 0] - rest[i, 0], rest[m, 1] - rest[i, 1], rest[m, 2] - rest[i, 2]
-        # V times the inverse of the rest edges: a sixth of their cofactors.
-        ux, uy, uz = (by * cz - bz * cy) / 6.0, (bz * cx - bx * cz) / 6.0, (bx * cy - by * cx) / 6.0
-        vx, vy, vz = (cy * az - cz * ay) / 6.0, (cz * ax - cx * az) / 6.0, (cx * ay - cy * ax) / 6.0
-        wx, wy, wz = (ay * bz - az * by) / 6.0, (az * bx - ax * bz) / 6.0, (ax * by - ay * bx) / 6.0
+        a, b, c = edge(rest, i, j), edge(rest, i, k), edge(rest, i, m)
+        # Six times V times the inverse of the rest edges: their cofactors.
+        u, v, w = corner_gradient(b, c), corner_gradient(c, a), corner_gradient(a, b)
         for row in range(3):
-            a = position[j, row] - position[i, row]
-            b = position[k, row] - position[i, row]
-            c = position[m, row] - position[i, row]
-            x = a * ux + b * vx + c * wx
-            y = a * uy + b * vy + c * wy
-            z = a * uz + b * vz + c * wz
+            along_a = position[j, row] - position[i, row]
+            along_b = position[k, row] - position[i, row]
+            along_c = position[m, row] - position[i, row]
+            x = along_a * (u[0] / 6.0) + along_b * (v[0] / 6.0) + along_c * (w[0] / 6.0)
+            y = along_a * (u[1] / 6.0) + along_b * (v[1] / 6.0) + along_c * (w[1] / 6.0)
+            z = along_a * (u[2] / 6.0) + along_b * (v[2] / 6.0) + along_c * (w[2] / 6.0)
             for corner in range(4):
                 node = tets[tet, corner]
                 gradient[node, row, 0] += x
@@ -97,8 +91,5 @@ def fill_volume_ratios(position, tets, rest_volume, ratio):
     """
     for tet in range(tets.shape[0]):
         i, j, k, m = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
-        ax, ay, az = position[j, 0] - position[i, 0], position[j, 1] - position[i, 1], position[j, 2] - position[i, 2]
-        bx, by, bz = position[k, 0] - position[i, 0], position[k, 1] - position[i, 1], position[k, 2] - position[i, 2]
-        cx, cy, cz = position[m, 0] - position[i, 0], position[m, 1] - position[i, 1], position[m, 2] - position[i, 2]
-        volume = (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)) / 6.0
-        ratio[tet] = volume / rest_volume[tet]
+        _, six = tet_shape(edge(position, i, j), edge(position, i, k), edge(position, i, m))
+        ratio[tet] = six / 6.0 / rest_volume[tet]

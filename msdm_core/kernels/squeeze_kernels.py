@@ -6,6 +6,7 @@ from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
     corner_gradient,
+    edge,
     spring_length,
     tet_shape,
     volume_ratio,
@@ -55,9 +56,9 @@ def hold_squeezed(
     for entry in range(count):
         for tet in range(squeezed[entry], min(squeezed[entry] + width, tets.shape[0])):
             corners = (tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3])
-            b = _edge(position, corners[0], corners[1])
-            c = _edge(position, corners[0], corners[2])
-            d = _edge(position, corners[0], corners[3])
+            b = edge(position, corners[0], corners[1])
+            c = edge(position, corners[0], corners[2])
+            d = edge(position, corners[0], corners[3])
             gb, six = tet_shape(b, c, d)
             ratio = volume_ratio(six, inverse_volume[tet])
             if not ratio < SQUEEZED_RATIO:
@@ -199,9 +200,3 @@ def hold_steep(
         x, y, z = pull * along[0], pull * along[1], pull * along[2]
         add_to_node(lanes, force, i, x, y, z)
         take_from_node(lanes, force, j, x, y, z)
-
-
-@njit(**INLINED)
-def _edge(position, a, b):
-    """From one node to another."""
-    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]

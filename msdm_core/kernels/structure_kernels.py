@@ -5,6 +5,7 @@ An organ alone has `OrganModel` and `OrganState`; organs of the same tets that a
 that is the whole. Arrays of models are read-only, which numba enforces at compile time.
 """
 
+from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -231,183 +232,56 @@ SCRATCH_FIELDS = (
 )
 
 
-class LaneModel(NamedTuple):
-    """The constants of organs side by side: read-only arrays, SI units; tets are shared, the lane is the last index.
+LaneModel = namedtuple(
+    "LaneModel",
+    (
+        "lanes",
+        *(name for name in OrganModel._fields if name not in ("tet_rest_volume", "node_rest_volume", "added_mass")),
+        *("surface_count", "support_count", "anchor_count"),
+    ),
+)
+LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units; tets are shared.
 
-    Rest shapes and anchors are shared too, or each lane's own. Their arrays are then (n, n_lane) in place of (n,), and
-    those of surface, supports and foundations have the lane as their first index; of the surface, of supports and of
-    anchored nodes a lane uses as many rows as it has.
+Fields are those of OrganModel, and `lanes`: as many zeros as there are lanes, so that their number is part of the
+compiled type. Each lane has its own node_mass, node_inverse_mass, spring_stiffness, node_softness, tet_bulk,
+tet_averaged_bulk and node_bulk (n, n_lane), and its own averages_volume and stable_step (n_lane,).
 
-    Fields:
-        lanes: as many zeros as there are lanes; their number is part of the compiled type
-        node_mass: lumped mass [kg]                                              (n_node, n_lane)
-        node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node, n_lane)
-        spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
-        spring_stiffness: [N/m]                                                  (n_spring, n_lane)
-        spring_rest_length: [m]                                                  (n_spring,) or own
-        stiffens, node_onset, node_growth, node_excess, steep_rise, steep_sweeps: as in OrganModel
-        node_softness: as in OrganModel [1/J]                                    (n_node, n_lane), (0, n_lane)
-        relaxes, spring_gain, spring_arm_modulus, arm_time: as in OrganModel
-        tet_nodes: corners of each tet                                           (n_tet, 4)
-        tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,) or own
-        tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet, n_lane)
-        tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet, n_lane)
-        node_inverse_volume: 1 / volume averaged at a node [1/m^3]               (n_node,) or own
-        node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node, n_lane)
-        averages_volume: whether any node_bulk of the lane is above 0            (n_lane,)
-        node_rest_position: undeformed position, of lane 0 if they differ [m]    (n_node, 3)
-        surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3) or own
-        surface_rest_area: [m^2]                                                 (n_surface,) or own
-        surface_count: how many of them each lane has                            (n_lane,)
-        support_nodes, support_area: as in OrganModel                            (n_support_node,) or own
-        support_count: how many of them each lane has                            (n_lane,)
-        support_kind and the other support_ fields: as in OrganModel
-        foundation_nodes: nodes that elastic foundations hold                    (n_held,)
-        foundation_position: where those nodes are without force [m]             (n_held, 3) or own
-        foundation_stiffness: as in OrganModel [N/m]                             (n_held, 3, 3) or own
-        motion_node_shift: as in OrganModel [m]                                  (n_motion, n_node, 4) or own, lane last
-        motion_anchored_nodes: as in OrganModel                                  (n_anchored,) or own
-        anchor_count: how many of them each lane has                             (n_lane,)
-        motion_foundation_shift: as in OrganModel [m]                            (n_motion, n_held, 3) or own
-        motion_support_shift: as in OrganModel [m]                               (n_motion, n_support, 3)
-        gravity: [m/s^2]                                                         (3,)
-        alpha: mass-proportional damping rate [1/s]                              scalar
-        beta: stiffness-proportional damping time [s]                            scalar
-        stable_step: largest stable step without contact of instruments [s]      (n_lane,)
-    """
+Rest shapes and anchors are shared too, or each lane's own. spring_rest_length, tet_inverse_volume, node_inverse_volume
+and motion_node_shift are then (..., n_lane), and those of surface, supports and foundations have the lane as their
+first index; of the surface, of supports and of anchored nodes a lane uses as many rows as it has: surface_count,
+support_count and anchor_count (n_lane,). node_rest_position is that of lane 0 if they differ.
+"""
 
-    lanes: tuple[int, ...]
-    node_mass: LaneArray
-    node_inverse_mass: LaneArray
-    spring_nodes: NDArray[np.int32]
-    spring_stiffness: LaneArray
-    spring_rest_length: FloatArray
-    stiffens: bool
-    node_softness: LaneArray
-    node_onset: FloatArray
-    node_growth: FloatArray
-    node_excess: FloatArray
-    steep_rise: float
-    steep_sweeps: int
-    relaxes: bool
-    spring_gain: FloatArray
-    spring_arm_modulus: FloatArray
-    arm_time: FloatArray
-    tet_nodes: NDArray[np.int32]
-    tet_inverse_volume: FloatArray
-    tet_bulk: LaneArray
-    tet_averaged_bulk: LaneArray
-    node_inverse_volume: FloatArray
-    node_bulk: LaneArray
-    averages_volume: NDArray[np.bool_]
-    node_rest_position: FloatArray
-    surface_triangles: NDArray[np.int32]
-    surface_rest_area: FloatArray
-    surface_count: NDArray[np.int32]
-    support_kind: NDArray[np.int32]
-    support_position: FloatArray
-    support_rotation: FloatArray
-    support_size: FloatArray
-    support_friction: FloatArray
-    support_nodes: NDArray[np.int32]
-    support_area: FloatArray
-    support_count: NDArray[np.int32]
-    support_stiffness: float
-    support_damping: float
-    support_tangential_stiffness: float
-    foundation_nodes: NDArray[np.int32]
-    foundation_position: FloatArray
-    foundation_stiffness: FloatArray
-    motion_node_shift: LaneArray
-    motion_anchored_nodes: NDArray[np.intp]
-    anchor_count: NDArray[np.int32]
-    motion_foundation_shift: FloatArray
-    motion_support_shift: FloatArray
-    gravity: FloatArray
-    alpha: float
-    beta: float
-    stable_step: FloatArray
+# Fields of the state that have the lane as last index in lanes, in their floating-point type; as first index; those
+# with one number a lane; and scratch that one lane uses after the other.
+LANE_COLUMNS = (
+    *("node_position", "node_velocity", "node_force", "spring_arm_tension", "spring_relief", "volume_ratio_smallest"),
+    *("node_tension", "node_steepness", "steep_rows", "steep_speed", "ground_rate", "moving", "finite_sum"),
+)
+LANE_ROWS = (
+    *("contact_engaged", "contact_stretch", "contact_candidates", "contact_passed", "support_stretch", "motion"),
+    *("ground_foundation", "ground_support", "ground_load"),
+)
+LANE_NUMBERS = ("lane_fault", "candidate_count", "contact_kept", "contact_count")
+LANE_SHARED = ("squeezed_tets", "spring_lengths", "steep_springs", "steep_places", "contact_hold")
 
+LaneState = namedtuple(
+    "LaneState",
+    (
+        *(*LANE_COLUMNS, *LANE_ROWS, *LANE_NUMBERS, *LANE_SHARED),
+        *("node_pairs", "contact_rows", "contact_places", "kept_force", "surface_count", "support_count"),
+    ),
+)
+LaneState.__doc__ = """What changes while organs side by side move, SI units.
 
-class LaneState(NamedTuple):
-    """What changes while organs side by side move, SI units.
-
-    Fields:
-        node_position: [m]                                                       (n_node, 3, n_lane)
-        node_velocity: [m/s]                                                     (n_node, 3, n_lane)
-        node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3, n_lane)
-        volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1, n_lane)
-        lane_fault: a FAULT_ code, or LANE_EMPTY; moves only if FAULT_NONE       (n_lane,)
-        contact_engaged: 1 where a quadrature point is held off by a shape       (n_lane, n_shape, n_surface * 4)
-        contact_stretch: tangential stretch of sticking friction [m]             (n_lane, n_shape, n_surface * 4, 3)
-        contact_candidates: scratch: triangles in reach, shape by shape          (n_lane, n_shape, n_surface)
-        contact_rows, contact_places: scratch: as in OrganState, of each lane if organs stiffen, else of one lane after
-            the other                                                            (n_lane or 1, n_row, ROW_WIDTH), ...
-        contact_hold: scratch of one lane after the other, as in OrganState
-        contact_passed: the shape and the triangle it passed through, after such a fault  (n_lane, 2)
-        support_stretch: tangential stretch of nodes that stick to supports [m]  (n_lane, n_support_node, n_support, 3)
-        motion: as in OrganState                                                 (n_lane, n_motion, 4)
-        ground_foundation: scratch: as in OrganState                             (n_lane, n_held, 3)
-        ground_support: scratch: as in OrganState                                (n_lane, n_support, 2, 3)
-        ground_load: scratch: as in OrganState                                   (n_lane, n_support, 3)
-        ground_rate: scratch: as in OrganState                                   (n_motion, n_lane)
-        node_tension: scratch: tension of the averaged volume term [Pa]          (n_node, n_lane)
-        squeezed_tets: scratch: tets that a lane has squeezed below SQUEEZED_RATIO (n_tet,)
-        node_pairs: scratch: as in OrganState                                    (2, n_node, n_lane), (2, 0, n_lane)
-        node_steepness: scratch: as in OrganState                                (n_node, n_lane), (0, n_lane)
-        spring_lengths: not used                                                 (0,)
-        steep_springs: scratch: springs that are steep in a lane                 (n_spring,), (0,) if none stiffens
-        steep_places: scratch: springs that are steep in any lane                (n_spring,), likewise
-        steep_rows: scratch: as in OrganState                                    (n_spring, STEEP_WIDTH, n_lane)
-        steep_speed: scratch: as in OrganState [m/s]                             (n_node, 3, n_lane)
-        spring_arm_tension: as in OrganState [N/m]                               (3 * n_spring, n_lane)
-        spring_relief: as in OrganState [N/m]                                    (n_spring, n_lane)
-        kept_force: scratch: node_force of the lanes that do not move [N]        (n_node, 3, n_lane)
-        moving: scratch: 1 where a lane moves, else 0                            (1, n_lane)
-        finite_sum: scratch: finite where a lane's positions and velocities are  (1, n_lane)
-        candidate_count: scratch: candidates of the busiest shape                (n_lane,)
-        contact_kept: scratch: 0 where the surface passed through an axis        (n_lane,)
-        contact_count: scratch: rows of contact_rows and contact_places in use   (n_lane,)
-        surface_count, support_count: how much of the memory belongs to a lane   (n_lane,)
-    """
-
-    node_position: LaneArray
-    node_velocity: LaneArray
-    node_force: LaneArray
-    volume_ratio_smallest: LaneArray
-    lane_fault: NDArray[np.int32]
-    contact_engaged: NDArray[np.uint8]
-    contact_stretch: FloatArray
-    contact_candidates: NDArray[np.int32]
-    contact_rows: FloatArray
-    contact_places: NDArray[np.int32]
-    contact_hold: FloatArray
-    contact_passed: NDArray[np.int32]
-    support_stretch: FloatArray
-    motion: FloatArray
-    ground_foundation: FloatArray
-    ground_support: FloatArray
-    ground_load: FloatArray
-    ground_rate: LaneArray
-    node_tension: LaneArray
-    squeezed_tets: NDArray[np.int32]
-    node_pairs: LaneArray
-    node_steepness: LaneArray
-    spring_lengths: FloatArray
-    steep_springs: NDArray[np.int32]
-    steep_places: NDArray[np.int32]
-    steep_rows: LaneArray
-    steep_speed: LaneArray
-    spring_arm_tension: LaneArray
-    spring_relief: LaneArray
-    kept_force: LaneArray
-    moving: LaneArray
-    finite_sum: LaneArray
-    candidate_count: NDArray[np.int32]
-    contact_kept: NDArray[np.uint8]
-    contact_count: NDArray[np.int32]
-    surface_count: NDArray[np.int32]
-    support_count: NDArray[np.int32]
+Fields are those of OrganState without its rows of four: LANE_COLUMNS (..., n_lane), LANE_ROWS (n_lane, ...),
+LANE_NUMBERS (n_lane,), of which lane_fault is LANE_EMPTY where no organ is, LANE_SHARED; and
+    node_pairs: scratch: as in OrganState                                        (2, n_node, n_lane), (2, 0, n_lane)
+    contact_rows, contact_places: scratch: as in OrganState, of each lane if organs stiffen, else of one lane after
+        the other                                                                (n_lane or 1, n_row, ROW_WIDTH), ...
+    kept_force: scratch: node_force of the lanes that do not move [N]            (n_node, 3, n_lane)
+    surface_count, support_count: how much of the memory belongs to a lane       (n_lane,)
+"""
 
 
 class ContactShapes(NamedTuple):

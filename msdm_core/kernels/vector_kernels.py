@@ -138,8 +138,6 @@ for _function, _instruction in (
 def root(_typing: Any, value: Any) -> Any:
     """Square root of a number or of every number of a vector, correctly rounded."""
     vector = isinstance(value, VectorType)
-    if not vector and not isinstance(value, types.Float):
-        return None
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         kind = values[0].type
@@ -153,9 +151,6 @@ def root(_typing: Any, value: Any) -> Any:
 @intrinsic
 def keep_lower(_typing: Any, new: Any, old: Any, of_new: Any, of_old: Any) -> Any:
     """Entry by entry `of_old` where old <= new, else `of_new`: a new value that is not a number is taken."""
-    vector = isinstance(new, VectorType)
-    if new != old or of_new != of_old or not (vector or isinstance(new, types.Float)):
-        return None
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">=", values[0], values[1]), values[3], values[2])
@@ -166,9 +161,6 @@ def keep_lower(_typing: Any, new: Any, old: Any, of_new: Any, of_old: Any) -> An
 @intrinsic
 def below_zero(_typing: Any, value: Any) -> Any:
     """Entry by entry min(value, 0)."""
-    vector = isinstance(value, VectorType)
-    if not vector and not isinstance(value, types.Float):
-        return None
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         zero = ir.Constant(values[0].type, [0.0] * value.width if isinstance(value, VectorType) else 0.0)
@@ -180,8 +172,6 @@ def below_zero(_typing: Any, value: Any) -> Any:
 @intrinsic
 def any_below(_typing: Any, value: Any, limit: Any) -> Any:
     """Whether a number, or any number of a vector, is below a limit."""
-    if not isinstance(value, VectorType | types.Float) or not isinstance(limit, types.Number):
-        return None
 
     def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         if not isinstance(value, VectorType):
@@ -223,8 +213,6 @@ def _define_load(width_of: Callable[[Any], int], scale: Callable[[int], int]) ->
 def _define_store(scale: Callable[[int], int]) -> Any:
     @intrinsic
     def store(_typing: Any, array: Any, index: Any, value: Any) -> Any:
-        if not isinstance(value, VectorType) or value.element != array.dtype:
-            return None
 
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
             place = builder.mul(values[1], ir.Constant(values[1].type, scale(value.width)))

@@ -18,7 +18,7 @@ from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
 from msdm_core.kernels.squeeze_kernels import STEEP_WIDTH
-from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneModel, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
 from msdm_core.kernels.vector_kernels import aligned_zeros
@@ -170,6 +170,7 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
 def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     """The undeformed organ at rest, without contact, with contact memory for `shape_count` shapes."""
     point_count = len(model.surface_triangles) * QUADRATURE_COUNT
+    steep_count = len(model.spring_nodes) if model.stiffens else 0
     return OrganState(
         node_position=model.node_rest_position.copy(),
         node_velocity=np.zeros_like(model.node_rest_position),
@@ -181,8 +182,11 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
         node_pairs=aligned_zeros((len(model.node_softness), 2)),
         node_steepness=np.zeros_like(model.node_softness),
-        spring_lengths=np.zeros(len(model.spring_nodes) if model.stiffens else 0),
-        **steep_scratch(model),
+        spring_lengths=np.zeros(steep_count),
+        steep_springs=np.zeros(steep_count, dtype=np.int32),
+        steep_places=np.zeros(steep_count, dtype=np.int32),
+        steep_rows=aligned_zeros((steep_count, STEEP_WIDTH)),
+        steep_speed=aligned_zeros((len(model.node_softness), 3)),
         spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
         spring_relief=np.zeros_like(model.spring_gain),
         contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
@@ -192,7 +196,7 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_places=np.zeros((shape_count * point_count, PLACE_WIDTH), dtype=np.int32),
         contact_hold=np.zeros_like(model.node_mass),
         contact_passed=np.zeros(2, dtype=np.int32),
-        support_stretch=np.zeros(support_shape(model)),
+        support_stretch=np.zeros((len(model.support_nodes), len(model.support_kind), 3)),
         motion=np.zeros((len(model.motion_node_shift), 4)),
         ground_foundation=model.foundation_position.copy(),
         ground_support=np.stack([model.support_position, np.zeros_like(model.support_position)], axis=1),
@@ -206,23 +210,6 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
         contact_kept=np.ones(1, dtype=np.uint8),
         contact_count=np.zeros(1, dtype=np.int32),
     )
-
-
-def steep_scratch(model: OrganModel, lanes: tuple[int, ...] = (), dtype: Any = np.float64) -> dict[str, NDArray[Any]]:
-    """The scratch fields of a state for `hold_steep`; empty where no spring stiffens.
-
-    Args:
-        model: the organ.
-        lanes: last index of the numbers of organs side by side, (n_lane,).
-        dtype: of those numbers.
-    """
-    springs = len(model.spring_nodes) if model.stiffens else 0
-    return {
-        "steep_springs": np.zeros(springs, dtype=np.int32),
-        "steep_places": np.zeros(springs, dtype=np.int32),
-        "steep_rows": aligned_zeros((springs, STEEP_WIDTH, *lanes), dtype),
-        "steep_speed": aligned_zeros((len(model.node_mass) if springs else 0, 3, *lanes), dtype),
-    }
 
 
 def _settle(model: OrganModel, state: OrganState) -> None:
@@ -294,11 +281,6 @@ def _relax(model: OrganModel, state: OrganState) -> None:
         f"the organ did not settle under gravity in {ROUNDS * ROUND_STEPS} steps: is it anchored, or does it "
         "rest on something? Give `anchors` or `supports`, or no gravity"
     )
-
-
-def support_shape(model: OrganModel | LaneModel) -> tuple[int, int, int]:
-    """Shape of the memory of supports, `support_stretch`: nodes that may be held, supports, 3."""
-    return len(model.support_nodes), len(model.support_kind), 3
 
 
 def _check_extent(mesh: TetMesh) -> None:

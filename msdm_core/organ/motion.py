@@ -1,7 +1,7 @@
 """Prescribed motion of what holds an organ, as by breathing: anchored nodes, foundations and supports follow signals.
 
 A motion m displaces the ground at a place X by s_m(t) d_m(X). The state holds its signal s_m and rate, which whoever
-advances the organ sets with `steer`; kernels move the ground in each substep and count the work that it does. Damping
+advances the organ sets; kernels move the ground in each substep and count the work that it does. Damping
 by mass (alpha) acts on velocities relative to the ground, as the tissue around an organ moves with it.
 """
 
@@ -102,11 +102,6 @@ def motion_fields(
     return fields
 
 
-def steer(state: OrganState, signal: ArrayLike, duration: float) -> None:
-    """Let each motion's signal change evenly to a value (n_motion,) over the next `duration` [s] of steps."""
-    state.motion[:, RATE] = (np.asarray(signal, dtype=np.float64) - state.motion[:, SIGNAL]) / duration
-
-
 def place_on_ground(model: OrganModel, state: OrganState, signal: ArrayLike, rate: ArrayLike) -> None:
     """Move an organ at rest with its ground to where signals (n_motion,) have it, at their rates (n_motion,) [1/s].
 
@@ -117,13 +112,3 @@ def place_on_ground(model: OrganModel, state: OrganState, signal: ArrayLike, rat
     shift = model.motion_node_shift[:, :, :3]
     state.node_position[:] += (state.motion[:, SIGNAL, None, None] * shift).sum(axis=0)
     state.node_velocity[:] += (state.motion[:, RATE, None, None] * shift).sum(axis=0)
-
-
-def ground_work(state: OrganState) -> FloatArray:
-    """Work that each motion of the ground has done on the organ [J], shape (n_motion,)."""
-    return state.motion[:, WORK].copy()
-
-
-def foundation_places(model: OrganModel, state: OrganState) -> FloatArray:
-    """Where the organ's foundations hold their nodes now [m], shape (n_held, 3)."""
-    return model.foundation_position + (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)

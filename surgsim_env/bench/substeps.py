@@ -7,9 +7,11 @@ from statistics import median
 
 import numpy as np
 
+from msdm_core.arithmetic import exp
 from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneState, OrganModel, OrganState
+from msdm_core.kernels.substep_kernels import advance_substeps
 from msdm_core.kernels.vector_kernels import lane_counts
-from msdm_core.lanes.lanes import advance_lanes, rest_lanes, stack_organs, stack_shapes
+from msdm_core.lanes.lanes import lane_responses, lanes_of, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
@@ -73,12 +75,14 @@ def abreast(model: OrganModel, dtype: type = np.float64, *, shear: float = 0.01,
     """Seconds of one substep of each of many organs side by side in vector registers; otherwise as `single`."""
     lanes = lane_counts(dtype)[0]
     organs = stack_organs([model] * lanes, dtype=dtype)
-    state = rest_lanes([model] * lanes, dtype=dtype)
+    state = lanes_of([rest_state(model)] * lanes, model, dtype=dtype)
     shapes, wrench = stack_shapes([NO_SHAPES] * lanes, lanes), np.zeros((lanes, 0, 6))
     dt = 0.5 * model.stable_step if dt is None else dt
+    decay, response, reference = float(exp(-model.alpha * dt)), lane_responses(0, lanes), shapes.tool_centre
 
     def advance(count: int) -> bool:
-        return bool((advance_lanes(organs, state, shapes, NO_CONTACT, dt, count, wrench) == FAULT_NONE).all())
+        advance_substeps(organs, state, shapes, NO_CONTACT, response, dt, decay, count, reference, wrench)
+        return bool((state.lane_fault == FAULT_NONE).all())
 
     run = sheared(state, shear, advance)
     return lambda: seconds_per_call(run) / lanes

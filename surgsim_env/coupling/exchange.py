@@ -77,10 +77,7 @@ def haptic_steps(
 
     Raises:
         RuntimeError: compiled, where MuJoCo's functions are not known to the linker (says why).
-        TypeError: tools with a `drive` of their own, which would not be called.
     """
-    if type(instrument).drive is not ToolBodies.drive:
-        raise TypeError(f"{type(instrument).__name__} has a drive of its own: haptic steps move the servo alone")
     if compiled and (missing := mujoco_library.missing()):
         raise RuntimeError(f"haptic steps cannot be compiled: {missing}; call haptic_steps with compiled=False")
     plan = StepPlan(dt, float(exp(-model.alpha * dt)), substep_count, count, force_limit, pull_limit)

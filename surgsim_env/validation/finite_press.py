@@ -16,6 +16,8 @@ from msdm_core.mesh.tet_mesh import FloatArray
 
 # Pressure per penetration that stands for a rigid ball [N/m^3]: 5 kPa make 5 um.
 RIGID = 1e9
+# Poisson's ratio of a membrane on the top.
+MEMBRANE_RATIO = 0.5
 # Largest step of the depth [m], Newton's tolerance on the residual over the ball's force, its most
 # iterations, how often its step is halved, and how many iterations may raise the residual.
 DEPTH_STEP = 2.5e-4
@@ -72,9 +74,7 @@ def layer_mesh(radius: float, depth: float, fine: float, reach: tuple[float, flo
 class PressedLayer:
     """A bonded layer of modulus E(r, z) [Pa] under a ball, quadratic elements at finite strain."""
 
-    def __init__(
-        self, mesh: Any, modulus: Modulus, poisson_ratio: float, *, membrane: float = 0.0, membrane_ratio: float = 0.5
-    ) -> None:
+    def __init__(self, mesh: Any, modulus: Modulus, poisson_ratio: float, *, membrane: float = 0.0) -> None:
         """Make the layer at rest.
 
         Args:
@@ -82,7 +82,6 @@ class PressedLayer:
             modulus: Young's modulus at places (r, z) [Pa].
             poisson_ratio: of all of it.
             membrane: modulus times thickness of a membrane on its top [N/m].
-            membrane_ratio: Poisson's ratio of the membrane.
         """
         from skfem import Basis, ElementQuad2, ElementVector, FacetBasis
 
@@ -102,7 +101,7 @@ class PressedLayer:
         self._weight = 2.0 * np.pi * r * self._basis.dx
         self._rates = _rates(self._basis, r)
         self._top_rates = _rates(self._top, self._top.global_coordinates()[0])
-        self._membrane = membrane / (1.0 - membrane_ratio**2), membrane_ratio
+        self._membrane = membrane / (1.0 - MEMBRANE_RATIO**2)
 
     def forces(self, radius: float, depths: Sequence[float], contact_stiffness: float = RIGID) -> list[float]:
         """Force of the ball at each of some rising depths of its lowest point below the surface at rest [N].
@@ -193,7 +192,7 @@ class PressedLayer:
         """Tangent stiffness [N/m] and forces of the solid and its membrane [N] at a displacement."""
         stress, tangent, _ = neo_hookean(self._strained(u), *self._moduli)
         matrix, vector = _assembled(self._basis, self._rates[:, :5], self._weight, stress, tangent)
-        if self._membrane[0] > 0.0:
+        if self._membrane > 0.0:
             more, pull = self._skin(u)
             matrix, vector = matrix + more, vector + pull
         return matrix, vector
@@ -207,7 +206,7 @@ class PressedLayer:
 
         Plane stress, C = E h / (1 - nu^2).
         """
-        size, ratio = self._membrane
+        size, ratio = self._membrane, MEMBRANE_RATIO
         rates, r = self._top_values(u), self._top.global_coordinates()[0]
         along, slope, hoop = 1.0 + rates[0], rates[2], 1.0 + rates[4]
         strain, round_strain = 0.5 * (along**2 + slope**2 - 1.0), 0.5 * (hoop**2 - 1.0)

@@ -22,7 +22,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.measure import node_strains
 from surgsim_env.validation.elements import Cells, Size
-from surgsim_env.validation.statics import averaged_gradient, volume_gradient
+from surgsim_env.validation.statics import averaged_gradient, block_sum, node_rows, volume_gradient
 
 Test = Literal["pull", "slide", "shear"]
 # Forces balance to this share of the force on a plate.
@@ -151,10 +151,8 @@ def _assembled(
     force: FloatArray, blocks: FloatArray, rows: NDArray[np.int64], count: int
 ) -> tuple[FloatArray, csc_array]:
     """Sums of element vectors (n, m) and matrices (n, m, m) at their rows (n, m)."""
-    width = rows.shape[1]
     total = np.bincount(rows.ravel(), force.ravel(), count).astype(np.float64)
-    left, right = np.repeat(rows, width, axis=1).ravel(), np.tile(rows, (1, width)).ravel()
-    return total, csc_array(coo_array((blocks.ravel(), (left, right)), shape=(count, count)))
+    return total, csc_array(block_sum(blocks, rows, count))
 
 
 def _forces(
@@ -265,13 +263,13 @@ class OrganBlock:
         dyads = direction[:, :, None] * direction[:, None, :]
         along = (stiffness[:, None, None] - across) * dyads + across * np.eye(3)
         blocks = np.block([[along, -along], [-along, along]])
-        total = _assembled(np.zeros((len(nodes), 6)), blocks, _rows(nodes), position.size)[1]
+        total = _assembled(np.zeros((len(nodes), 6)), blocks, node_rows(nodes), position.size)[1]
         if self.stiffening is None:
             return total
         pull = (model.spring_stiffness * change)[:, None] * direction
         values = np.concatenate([-pull, pull], axis=1)
         sums = coo_array(
-            (np.tile(values.ravel(), 2), (np.repeat(nodes.T.ravel(), 6), np.tile(_rows(nodes).ravel(), 2))),
+            (np.tile(values.ravel(), 2), (np.repeat(nodes.T.ravel(), 6), np.tile(node_rows(nodes).ravel(), 2))),
             shape=(len(position), position.size),
         ).tocsr()
         more = 0.5 * model.node_softness * (self.stiffening.tangent(strain) - 1.0 - rise) / strain**2
@@ -295,18 +293,13 @@ class OrganBlock:
         scale = slope / model.tet_rest_volume
         blocks = scale[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
         blocks += tension[:, None, None] * _volume_curvature(position[model.tet_nodes])
-        rows = _rows(model.tet_nodes)
+        rows = node_rows(model.tet_nodes)
         total = _assembled(np.zeros(rows.shape), blocks, rows, count)[1]
         if model.node_bulk.any():
             averaged = averaged_gradient(model.tet_nodes, gradient, count)
             weighted = averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
             total = total + averaged.T @ weighted
         return csc_array(total)
-
-
-def _rows(nodes: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Rows of the displacement of some nodes, (n, 3 m) for nodes (n, m)."""
-    return (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
 
 
 def _volume_curvature(corners: FloatArray) -> FloatArray:

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.kernels.structure_kernels import FAULT_NONE
 from msdm_core.material.regions import boundary_layer
 from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray
 from msdm_core.organ.compile import rest_state
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
+from msdm_core.organ.stepping import advance_or_raise
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import press
 from surgsim_env.palpation.surface_drawing import OrthographicView
@@ -68,14 +67,11 @@ def twist_prism(angle: float = TWIST) -> Deformed:
     arm = rest[top, :2] - middle[:2]
     state = rest_state(model)
     dt = 0.5 * model.stable_step
-    wrench = np.zeros((0, 6))
     for time in np.arange(0.0, TWIST_TIME + REST_TIME, 10 * dt):
         turn = angle * min(1.0, time / TWIST_TIME)
         cosine, sine = math.cos(turn), math.sin(turn)
         state.node_position[top, :2] = middle[:2] + arm @ np.array([[cosine, sine], [-sine, cosine]])
-        fault = advance_organ(model, state, NO_SHAPES, NO_CONTACT, dt, 10, wrench)
-        if fault != FAULT_NONE:
-            raise ValueError(describe_fault(model, state, fault))
+        advance_or_raise(model, state, dt, 10)
     lever = state.node_position[top] - middle
     torque = -float(np.cross(lever, state.node_force[top])[:, 2].sum())
     smallest = float(state.volume_ratio_smallest[0])

@@ -16,47 +16,18 @@ from msdm_core.material.tissue_law import Relaxation
 from msdm_core.mesh.tet_mesh import FloatArray
 
 
-def loss_tangent(arms: Relaxation, frequency: float) -> float:
-    """Loss over storage modulus of the springs at a frequency [Hz].
-
-    G* = 1 + sum g_i (i w tau_i) / (1 + i w tau_i), w = 2 pi f.
-    """
-    turn = 2.0j * np.pi * frequency * np.asarray(arms.times)
-    modulus = 1.0 + np.sum(np.asarray(arms.relative_moduli) * turn / (1.0 + turn))
-    return float(modulus.imag / modulus.real)
-
-
 def spring_creep(arms: Relaxation, time: FloatArray) -> FloatArray:
-    """Strain of springs under a constant load over the final one, of times [s], shape (n,)."""
-    return _crept(np.ones((1, 1)), np.zeros((1, 1)), np.ones(1), arms, time)[:, 0]
+    """Strain of springs under a constant load over the final one, of times [s], shape (n,).
 
-
-def bar_creep(poisson_ratio: float, arms: Relaxation, time: FloatArray) -> FloatArray:
-    """Strain of a bar with free sides under a constant load over the final one, of times [s], shape (n,).
-
-    Springs have lambda = mu, their volume term adds K_t = mu (4 nu - 1) / (1 - 2 nu) and stays elastic. In strains
-    (along, across) the stresses are mu [[3, 2], [1, 4]] and K_t [[1, 2], [1, 2]].
+    (1 + sum g) u - sum g_i u_i = 1, du_i/dt = (u - u_i) / tau_i, u_i = 0 at 0.
     """
-    added = (4.0 * poisson_ratio - 1.0) / (1.0 - 2.0 * poisson_ratio)
-    springs, volume = np.array([[3.0, 2.0], [1.0, 4.0]]), added * np.array([[1.0, 2.0], [1.0, 2.0]])
-    strain = _crept(springs, volume, np.array([1.0, 0.0]), arms, time)[:, 0]
-    return strain / np.linalg.solve(springs + volume, [1.0, 0.0])[0]
-
-
-def _crept(springs: FloatArray, volume: FloatArray, load: FloatArray, arms: Relaxation, time: FloatArray) -> FloatArray:
-    """The u(t) with ((1 + sum g) S + V) u - sum g_i S u_i = f, du_i/dt = (u - u_i) / tau_i, u_i = 0 at 0, (n, m)."""
     shares, times = np.asarray(arms.relative_moduli), np.asarray(arms.times)
-    width = len(load)
-    inverse = np.linalg.inv((1.0 + shares.sum()) * springs + volume)
-    # u = inverse f + taken (u_1, u_2, ...): a linear equation for the arms alone.
-    taken = np.hstack([share * inverse @ springs for share in shares])
-    rate = np.vstack([(taken - np.eye(width, width * len(times), width * arm)) / tau for arm, tau in enumerate(times)])
-    drive = np.concatenate([inverse @ load / tau for tau in times])
-    found = []
-    for moment in np.asarray(time, dtype=np.float64):
-        arm = np.linalg.solve(rate, (expm(rate * moment) - np.eye(len(rate))) @ drive)
-        found.append(inverse @ load + taken @ arm)
-    return np.array(found)
+    # u = first + taken (u_1, u_2, ...): a linear equation for the arms alone.
+    first = 1.0 / (1.0 + shares.sum())
+    taken, still = first * shares, np.eye(len(times))
+    rate, drive = (taken - still) / times[:, None], first / times
+    strains = [taken @ np.linalg.solve(rate, (expm(rate * moment) - still) @ drive) for moment in time]
+    return first + np.array(strains)
 
 
 @dataclass(eq=False)

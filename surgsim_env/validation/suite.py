@@ -132,15 +132,12 @@ class Validation:
         return "; ".join(part for part in (known, row.note) if part)
 
 
-def load_shortfalls(path: Path = SHORTFALLS) -> dict[str, Shortfall]:
-    """Known shortfalls by the case's name; ValueError for an entry without a reason."""
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
+def load_shortfalls() -> dict[str, Shortfall]:
+    """Known shortfalls by the case's name."""
+    table = tomllib.loads(SHORTFALLS.read_text(encoding="utf-8"))
     found: dict[str, Shortfall] = {}
-    for entry in table.get("shortfall", []):
-        reason = str(entry.get("reason", "")).strip()
-        if not reason or not entry.get("cases"):
-            raise ValueError(f"{path.name}: every [[shortfall]] needs `cases` and a `reason`; got {entry}")
-        found.update({case: Shortfall(reason, float(error)) for case, error in entry["cases"].items()})
+    for entry in table["shortfall"]:
+        found.update({case: Shortfall(entry["reason"], error) for case, error in entry["cases"].items()})
     return found
 
 

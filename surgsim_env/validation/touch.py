@@ -12,14 +12,15 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.errors import OrganDivergedError
+from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.material.regions import Damping, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import tissue_load
 from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import advance_organ, round_shapes
+from msdm_core.organ.stepping import advance_or_raise, round_shapes
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import press
 from surgsim_env.scene.anatomy import load_anatomy
@@ -94,10 +95,6 @@ def held_forces(scene: Scene, depths: tuple[float, ...]) -> list[float]:
     return forces
 
 
-class LostError(ValueError):
-    """A run that ended with a fault."""
-
-
 @dataclass(frozen=True, eq=False)
 class BallOnOrgan:
     """A ball with prescribed motion on an organ: the organ, its contact law, the substeps in a haptic step."""
@@ -112,15 +109,16 @@ class BallOnOrgan:
         return cls(model, law, math.ceil(STEP / (0.95 * stable_dt(model, law))))
 
     def move(self, state: OrganState, shapes: ContactShapes, velocity: ArrayLike, count: int) -> FloatArray:
-        """Force on the ball in each haptic step at a velocity [m/s], shape (count, 3) [N]; LostError at a fault."""
+        """Force on the ball in each haptic step at a velocity [m/s], shape (count, 3) [N].
+
+        Raises:
+            OrganDivergedError: a fault.
+        """
         shapes.tool_twist[0, :3] = velocity
         force = np.zeros((count, 3))
-        wrench = np.zeros((1, 6))
         dt = STEP / self.substep_count
         for number in range(count):
-            if advance_organ(self.model, state, shapes, self.law, dt, self.substep_count, wrench) != FAULT_NONE:
-                raise LostError(f"a fault after {number} haptic steps")
-            force[number] = wrench[0, :3]
+            force[number] = advance_or_raise(self.model, state, dt, self.substep_count, shapes, self.law)[0, :3]
         return force
 
     def held(self, site: ArrayLike, radius: float, depth: float) -> float:
@@ -367,6 +365,6 @@ def _deep(touch: BallOnOrgan, site: ArrayLike, radius: float, speed: float, targ
     while not force or (force[-1] < target and len(force) * speed * STEP < 0.025):
         try:
             force.append(float(touch.move(state, shapes, (0.0, 0.0, -speed), 1)[0, 2]))
-        except LostError:
+        except OrganDivergedError:
             return np.array(force), True
     return np.array(force), False

@@ -15,7 +15,6 @@ from msdm_core.kernels.structure_kernels import FAULT_NONE
 from surgsim_env.coupling import mujoco_library
 from surgsim_env.coupling.exchange import haptic_steps, step_outcome
 from surgsim_env.coupling.haptic_kernels import StepPlan, advance_haptic_steps
-from surgsim_env.instruments.tool_bodies import ToolBodies
 from tests.allocations import allocations
 from tests.coupling.test_compiled_step import DOWN, on_phantom, pair
 from tests.coupling.test_exchange import LAW, free_ball, free_organ
@@ -99,20 +98,6 @@ def test_without_the_library_the_plain_loop_runs_and_says_so_once(monkeypatch):
     model, state = free_organ()
     with pytest.raises(RuntimeError, match=reason):
         haptic_steps(model, state, free_ball(), LAW, 2e-4, 5, np.zeros((1, 6)), compiled=True)
-
-
-def test_tools_that_drive_themselves_are_refused():
-    """Haptic steps would not call what a subclass wrote."""
-
-    class Shaker(ToolBodies):
-        def drive(self) -> None:
-            self.data.ctrl[:] = 1.0
-
-    model, state = free_organ()
-    shaker = Shaker(free_ball().model)
-    with pytest.raises(TypeError, match="Shaker has a drive of its own"):
-        haptic_steps(model, state, shaker, LAW, 2e-4, 5, np.zeros((1, 6)))
-    assert shaker.data.time == 0.0
 
 
 FRESH = """

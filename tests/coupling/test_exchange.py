@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel, OrganState
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import angular_momentum, momentum
 from surgsim_env.coupling import haptic_kernels
 from surgsim_env.coupling.exchange import haptic_steps
 from surgsim_env.coupling.simulation import Simulation
@@ -22,6 +21,7 @@ from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import Scene
 from tests.core import oracle
+from tests.core.measures import angular_momentum, momentum
 
 DT, SUBSTEPS = 1e-3, 5
 LAW = ContactLaw(stiffness=2e7, damping=300.0, friction=0.3, tangential_stiffness=1e7)

@@ -8,7 +8,7 @@ import pytest
 
 from msdm_core.material.regions import Material
 from surgsim_env.scene.load import list_materials, make_material, scene_from_table, scenes_folder
-from surgsim_env.validation.relaxation import loss_tangent
+from tests.core.measures import loss_tangent
 
 PHANTOM = tomllib.loads((scenes_folder() / "organs" / "phantom.toml").read_text())
 OWN = """

@@ -71,12 +71,3 @@ def test_a_run_passes_only_where_every_shortfall_is_known(monkeypatch):
     assert found.passed and found.reason(found.rows[1]) == "soft"
     known["bad"] = suite.Shortfall("soft", 0.9)
     assert not suite.run_cases(quick=False, console=Console(quiet=True), cases=cases).passed
-
-
-def test_shortfalls_have_reasons(tmp_path):
-    path = tmp_path / "list.toml"
-    path.write_text('[[shortfall]]\nreason = "soft"\ncases = { a = 0.1, b = 0.2 }\n')
-    assert suite.load_shortfalls(path) == {"a": suite.Shortfall("soft", 0.1), "b": suite.Shortfall("soft", 0.2)}
-    path.write_text('[[shortfall]]\nreason = " "\ncases = { a = 0.1 }\n')
-    with pytest.raises(ValueError, match="needs `cases` and a `reason`"):
-        suite.load_shortfalls(path)

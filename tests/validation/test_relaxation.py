@@ -2,17 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import spsolve
 
 from msdm_core.material.tissue_law import Relaxation
-from surgsim_env.validation.relaxation import (
-    ViscoelasticBody,
-    bar_creep,
-    loss_tangent,
-    spring_creep,
-)
+from surgsim_env.validation.relaxation import ViscoelasticBody, spring_creep
+from tests.core.measures import loss_tangent
 
 ARMS = Relaxation(relative_moduli=(0.3, 0.3, 0.3), times=(0.05, 0.5, 5.0))
 TIME = np.array([0.01, 0.1, 1.0, 10.0, 100.0])
@@ -31,29 +26,6 @@ def test_one_arm_creeps_as_a_standard_solid():
     arm = Relaxation(relative_moduli=(0.8,), times=(2.0,))
     expected = 1.0 - 0.8 / 1.8 * np.exp(-TIME / (1.8 * 2.0))
     np.testing.assert_allclose(spring_creep(arm, TIME), expected, rtol=1e-10)
-    # Without a volume term a bar creeps as its springs do.
-    np.testing.assert_allclose(bar_creep(0.25, arm, TIME), expected, rtol=1e-10)
-
-
-def test_a_bar_creeps_as_its_equations_integrated_step_by_step():
-    """The same equations by an integrator, with q_i instead of r_i."""
-    nu, times, shares = 0.45, np.array(ARMS.times), np.array(ARMS.relative_moduli)
-    added = (4.0 * nu - 1.0) / (1.0 - 2.0 * nu)
-    springs, volume = np.array([[3.0, 2.0], [1.0, 4.0]]), added * np.array([[1.0, 2.0], [1.0, 2.0]])
-    load = np.array([1.0, 0.0])
-
-    def strain(arms):
-        return np.linalg.solve((1.0 + shares.sum()) * springs + volume, load + springs @ (shares @ arms))
-
-    def rate(_, flat):
-        arms = flat.reshape(3, 2)
-        return ((strain(arms) - arms) / times[:, None]).ravel()
-
-    found = solve_ivp(rate, (0.0, 100.0), np.zeros(6), t_eval=TIME, rtol=1e-10, atol=1e-12, method="LSODA")
-    end = np.linalg.solve(springs + volume, load)[0]
-    expected = [strain(arms.reshape(3, 2))[0] / end for arms in found.y.T]
-    np.testing.assert_allclose(bar_creep(nu, ARMS, TIME), expected, rtol=1e-7)
-    assert bar_creep(nu, ARMS, np.array([1e4]))[0] == pytest.approx(1.0)
 
 
 def body(arms=ARMS):

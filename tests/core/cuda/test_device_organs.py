@@ -29,13 +29,12 @@ def test_simulated_presses_are_those_of_the_organ_alone():
     # Forces are added node by node here, tet by tet there; float32 rounds a wrench of many points.
     for name, tolerance in (("float64", 1e-12), ("float32", 1e-4), ("alone", 1e-12)):
         worst = presses[name]
-        assert worst["wrench"] < tolerance and worst["velocity"] < tolerance and worst["area"] < 1e-6, (name, worst)
+        assert worst["wrench"] < tolerance and worst["velocity"] < tolerance, (name, worst)
         assert worst["engaged"] == 0 and worst["squeezed"] < 0.6
     assert presses["float64"]["fault"] == presses["float32"]["fault"] == FAULT_INVERTED_TET
-    assert presses["float64"]["inverted"] == 1 and presses["alone"]["inverted"] == 0
 
 
-@pytest.mark.parametrize("name", ["advance_lanes", pytest.param("advance_organ", marks=pytest.mark.slow), "look"])
+@pytest.mark.parametrize("name", ["advance_lanes", pytest.param("advance_organ", marks=pytest.mark.slow)])
 def test_kernels_compile_for_a_device(name: str, monkeypatch: pytest.MonkeyPatch):
     """PTX for compute capability 9.0; a float32 kernel multiplies and adds no float64 numbers."""
     pytest.importorskip("cuda.bindings.nvvm", reason="needs CUDA's compiler NVVM")
@@ -53,11 +52,8 @@ def test_kernels_compile_for_a_device(name: str, monkeypatch: pytest.MonkeyPatch
     organ = oracle.block((0.03, 0.02, 0.02), (3, 2, 2), anchored_below=0.0)
     real = np.float32
     arrays = DeviceArrays.of(organ, 1, tool(0), real, blocks=1, threads=8, room=1)
-    if name == "look":
-        given = (arrays.model, arrays.state, np.zeros((1, 3), real), np.zeros((1, 4), real), np.zeros(1, np.int32))
-    else:
-        law = ContactLaw(*(real(1.0) for _ in ContactLaw._fields))
-        given = (*arrays, law, organ_steps.StepNumbers(real(1e-4), real(1.0), 3, 1))
+    law = ContactLaw(*(real(1.0) for _ in ContactLaw._fields))
+    given = (*arrays, law, organ_steps.StepNumbers(real(1e-4), real(1.0), 3, 1))
     signature = types.void(*(typeof(value) for value in given))
     ptx, _ = cuda.compile_ptx(DeviceFunctions(real).typed(getattr(organ_steps, name)), signature, cc=(9, 0))
     assert ".target sm_90" in ptx

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from msdm_core.kernels.structure_kernels import SCRATCH_FIELDS, ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.material.regions import Damping
 from msdm_core.organ.compile import rest_state
-from msdm_core.organ.measure import internal_forces, potential_energy, volume_ratios
+from msdm_core.organ.measure import potential_energy, volume_ratios
 from msdm_core.organ.stepping import advance, advance_organ
 from tests.core import oracle
+from tests.core.measures import internal_forces
 
 SEEDS = (0, 1, 2)
 ELASTIC = ContactLaw(stiffness=2e7, damping=0.0, friction=0.0, tangential_stiffness=1e7)

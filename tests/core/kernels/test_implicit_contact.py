@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.material.regions import Damping
 from msdm_core.organ.compile import rest_state
-from msdm_core.organ.measure import momentum
 from msdm_core.organ.stability import largest_frequency, stable_dt
 from msdm_core.organ.stepping import advance_organ, round_shapes
 from tests.core import oracle
+from tests.core.measures import momentum
 
 SMOOTH = ContactLaw(stiffness=1e8, damping=100.0, friction=0.0, tangential_stiffness=5e7)
 ROUGH = SMOOTH._replace(friction=0.3)

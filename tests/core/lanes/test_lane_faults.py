@@ -14,9 +14,10 @@ from msdm_core.kernels.structure_kernels import (
     OrganState,
     ToolResponse,
 )
-from msdm_core.lanes.lanes import advance_lanes, get_lane, lane_shapes, put_lane, set_lane
+from msdm_core.lanes.lanes import get_lane, lane_shapes, put_lane, set_lane
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stepping import advance_organ, describe_fault, unyielding
+from tests.core.lanes.abreast import advance_lanes
 from tests.core.lanes.test_lanes import LAW, SUBSTEP, SUBSTEPS, pressed_organs, pressing, same, tool, varied, yielding
 
 

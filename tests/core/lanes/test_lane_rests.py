@@ -8,27 +8,19 @@ import pytest
 
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import ContactShapes, LaneModel, LaneState, OrganModel, OrganState
-from msdm_core.lanes.lanes import (
-    advance_lanes,
-    get_lane,
-    lane_shapes,
-    put_lane,
-    rest_lanes,
-    same_rest,
-    set_lane,
-    stack_organs,
-    stack_shapes,
-)
+from msdm_core.lanes.lanes import get_lane, lane_shapes, put_lane, same_rest, set_lane, stack_organs, stack_shapes
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.foundation import Foundation
-from msdm_core.organ.motion import Motion, ground_work, steer
+from msdm_core.organ.motion import Motion
 from msdm_core.organ.stepping import advance_organ
 from msdm_core.organ.support import Support, SupportLaw
 from tests.core import oracle
+from tests.core.lanes.abreast import advance_lanes, rest_lanes
 from tests.core.lanes.test_lanes import DAMPED, LAW, SUBSTEP, SUBSTEPS, same, varied
+from tests.core.measures import ground_work, steer
 
 SIZE, CELLS = (0.03, 0.02, 0.02), (6, 4, 4)
 DOWN = (0.0, 0.0, -9.81)
@@ -194,6 +186,3 @@ def test_another_organ_comes_into_a_lane():
         pass
     both.assert_same()
     assert both.wrench[:, 0, 2].all()
-    with pytest.raises(OrganError, match="surface_count of the lanes' organs and of their states differ"):
-        put_lane(both.state, 2, rest_state(drawn(5), shape_count=1))
-        next(both.press(1))

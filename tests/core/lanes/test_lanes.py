@@ -23,22 +23,13 @@ from msdm_core.kernels.structure_kernels import (
     ToolResponse,
 )
 from msdm_core.kernels.substep_kernels import advance_substeps, evaluate_forces
-from msdm_core.lanes.lanes import (
-    advance_lanes,
-    get_lane,
-    lane_responses,
-    lane_shapes,
-    put_lane,
-    rest_lanes,
-    set_lane,
-    stack_organs,
-    stack_shapes,
-)
+from msdm_core.lanes.lanes import get_lane, lane_responses, lane_shapes, put_lane, set_lane, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stepping import advance_organ, unyielding
 from tests.allocations import allocations
 from tests.core import oracle
+from tests.core.lanes.abreast import advance_lanes, rest_lanes
 
 LAW = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffness=1e7)
 DAMPED = Damping(alpha=20.0, beta=2e-5)
@@ -315,5 +306,3 @@ def test_only_organs_that_share_a_mesh_stand_side_by_side():
         stack_organs([one] * 9)
     with pytest.raises(OrganError, match="16"):
         stack_organs([one], lanes=16)
-    with pytest.raises(OrganError, match="lane 8"):
-        set_lane(model, 8, one)

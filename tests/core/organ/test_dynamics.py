@@ -11,17 +11,10 @@ from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel, OrganSta
 from msdm_core.material.regions import Damping, Material
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import (
-    angular_momentum,
-    internal_forces,
-    inverted_tets,
-    kinetic_energy,
-    momentum,
-    potential_energy,
-    volume_ratios,
-)
+from msdm_core.organ.measure import inverted_tets, kinetic_energy, potential_energy, volume_ratios
 from msdm_core.organ.stepping import advance
 from tests.core import oracle
+from tests.core.measures import angular_momentum, internal_forces, momentum
 
 EXACT = 1e-12
 GRAVITY = 9.81

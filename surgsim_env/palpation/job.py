@@ -38,8 +38,6 @@ from surgsim_env.scene.palpable_surface import (
     PalpableFace,
     contact_radius,
     hidden_share,
-    hidden_text,
-    share_text,
     tangent_axes,
 )
 
@@ -395,7 +393,6 @@ def _map_entry(one: ContrastMap, misses: Sequence[Miss]) -> dict[str, Any]:
         "false_alarms": one.false_alarms,
         "healthy_sites": one.healthy_count,
         "healthy_std": one.healthy_std,
-        "healthy_robust_std": one.healthy_robust_std,
     }
 
 
@@ -434,23 +431,9 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
             # Markup would take [[anchors]] for a style.
             console.print(f"not held well: {fault}", highlight=False, markup=False)
     early = int((~palpation.used).sum())
-    every = (*palpation.presses, *palpation.model_presses)
     console.print(
         f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not "
-        f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, "
-        f"smallest volume ratio {min(press.volume_ratio_smallest for press in every):.2f}"
-    )
-    console.print(
-        f"largest contact pressure {1e-3 * max(press.load.pressure for press in palpation.presses):.2f} kPa, largest "
-        f"strain of the tissue {100.0 * max(press.load.strain for press in palpation.presses):.0f} %"
-    )
-    scene = palpation.anatomy.scene
-    share = share_text(palpation.anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth)
-    console.print(f"cell / contact radius {share}")
-    console.print(hidden_text(*_touch(palpation)))
-    console.print(
-        f"simulated {palpation.simulated_time:.1f} s in {palpation.wall_time:.1f} s: "
-        f"{palpation.simulated_time / palpation.wall_time:.2f} times real time"
+        f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N"
     )
     for index in np.flatnonzero(~palpation.used).tolist():
         console.print(f"  site {index} ended early: {early_end(palpation, index)}")

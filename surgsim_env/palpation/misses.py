@@ -11,7 +11,6 @@ from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.contrast_map import ContrastMap, LesionScore, smoothed
 from surgsim_env.palpation.press import scan
-from surgsim_env.palpation.scores import LesionReach
 from surgsim_env.palpation.truth import Truth, felt_weights, surface_points
 from surgsim_env.scene.anatomy import Anatomy
 
@@ -19,6 +18,8 @@ from surgsim_env.scene.anatomy import Anatomy
 HIDDEN_RATIO = 2.0
 # A baseline from fewer healthy sites is weak.
 HEALTHY_FEWEST = 8
+# The sensor's noise hides a lesion that changes a press's force by less than this many of its standard deviations.
+NOISES_LEAST = 2.0
 
 NOT_FACED, NEAR_SUPPORT, NO_SITE, NOISE, TOO_DEEP, NO_MAXIMUM = (
     *("not under the pressed face", "too near a support", "no complete press near it", "below the sensor's noise"),
@@ -88,11 +89,11 @@ def explain_misses(
             scan(anatomy, model, truth.point[None], truth.normal[None], workers=1, progress=advance)[0].force
             for model in (organ, bare)
         )
-        reach = LesionReach(force, force_without, anatomy.scene.sensor.noise)
+        noise = anatomy.scene.sensor.noise
         for one in maps:
             if one.scores[index].felt:
                 continue
-            reason, text = _why(one, one.scores[index], reach, hidden, pressed)
+            reason, text = _why(one, one.scores[index], (force, force_without), noise, hidden, pressed)
             if one.healthy_count < HEALTHY_FEWEST:
                 text += f"; the baseline is weak: {one.healthy_count} healthy sites, {HEALTHY_FEWEST} are the rule"
             misses.append(Miss(one.name, truth.name, reason, f"{reason}: {text}"))
@@ -119,14 +120,14 @@ def _hidden(anatomy: Anatomy, lesion: Lesion, truth: Truth) -> tuple[str, str] |
 def _why(
     one: ContrastMap,
     score: LesionScore,
-    reach: LesionReach,
+    forces: tuple[float, float],
+    noise: float,
     hidden: tuple[str, str] | None,
     pressed: PressedSites,
 ) -> tuple[str, str]:
-    truth, contrast = score.truth, reach.force / reach.force_without
-    felt = (
-        f"a press feels {reach.force:.3f} N, {reach.force_without:.3f} N without the lesion (contrast {contrast:.2f})"
-    )
+    truth, (force, force_without) = score.truth, forces
+    contrast = force / force_without
+    felt = f"a press feels {force:.3f} N, {force_without:.3f} N without the lesion (contrast {contrast:.2f})"
     weak = contrast - 1.0 < one.threshold
     if hidden is not None and weak:
         return hidden
@@ -135,8 +136,8 @@ def _why(
         early = norm(pressed.ended_early - truth.point, axis=1) <= pressed.spacing
         said = f"{int(early.sum())} presses near it ended early, " if early.any() else ""
         return NO_SITE, f"{said}the nearest site of the map is {away.min() * 1e3:.1f} mm away"
-    if reach.below:
-        return NOISE, f"{felt}; the sensor's noise is {reach.noise:g} N"
+    if abs(force - force_without) < NOISES_LEAST * noise:
+        return NOISE, f"{felt}; the sensor's noise is {noise:g} N"
     if weak:
         return TOO_DEEP, f"{felt}; this map shows what exceeds its surroundings by {one.threshold:.2f}"
     level = float(smoothed(pressed.sites, one.contrast, spacing=pressed.spacing)[int(np.argmin(away))])

@@ -48,7 +48,6 @@ ORDER = {
             "record_demonstrations",
             "behaviour_cloning",
             "train_rllib",
-            "leaderboard_tables",
             "leaderboard",
         ),
     ),

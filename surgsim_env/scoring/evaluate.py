@@ -1,17 +1,17 @@
 """Play a method on seeds, score it, and write the result: baselines, trained policies, agents of others.
 
 Results of the project's own methods on all evaluation seeds go to agents/results of a checkout, one file per method,
-scene and level. Other results are printed, and written where the options `results` or `submit` say.
+scene and level. Other results are printed, and written where the option `results` says.
 """
 
 import datetime
 import importlib
-import json
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +46,8 @@ from surgsim_env.scoring.options import ScoringOptions
 from surgsim_env.scoring.results import (
     SITES,
     Result,
-    family,
     load_result,
     load_results,
-    place_name,
     seeds_text,
     shipped_results,
 )
@@ -74,7 +72,7 @@ class Player:
         name: of the method.
         actor: what plays; None: the oracle's script.
         env_id, kwargs: the environment.
-        command: that scores it.
+        chosen_by: the option of `surgsim evaluate` that names it, and its value.
         sees_truth: whether it may see what is hidden.
         own_estimate: whether its own estimate is scored.
         ours: whether its result belongs in agents/results.
@@ -85,7 +83,7 @@ class Player:
     actor: Actor | EpisodeActor | None
     env_id: str
     kwargs: dict[str, Any]
-    command: str
+    chosen_by: tuple[str, str]
     sees_truth: bool = False
     own_estimate: bool = False
     ours: bool = True
@@ -232,25 +230,22 @@ def find_player(name: str, options: ScoringOptions) -> Player:
     Raises:
         ValueError: an unknown name, or a class that is not there.
     """
-    command = f"surgsim evaluate --agent {name}"
+    chosen_by = ("--agent", name)
     if ":" in name:
         return _strangers_player(name, options)
     if name in ORACLES:
         env_id, has_places = ORACLES[name]
         kwargs = _places(options, PLACES if has_places else {})
-        return Player(name, None, env_id, kwargs, command + _place_options(kwargs), sees_truth=True)
+        return Player(name, None, env_id, kwargs, chosen_by, sees_truth=True)
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
-        kwargs = _places(options, PLACES if script.has_places else {})
-        command += _place_options(kwargs)
-        kwargs |= script.kwargs
-        return Player(name, script.make(kwargs), script.env_id, kwargs, command)
+        kwargs = _places(options, PLACES if script.has_places else {}) | script.kwargs
+        return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by)
     make, kwargs = find_agent(name), _places(options, PLACES)
-    command += _place_options(kwargs)
     if name in REFERENCES:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
-    return Player(name, AgentActor(make), SITES, kwargs, command, *_declared(make()))
+    return Player(name, AgentActor(make), SITES, kwargs, chosen_by, *_declared(make()))
 
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
@@ -262,12 +257,9 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
     # A split that --env-arguments name is meant.
     kwargs = {**_places(options, own), **options.env_kwargs}
-    command = f"surgsim evaluate --agent {name}" + f" --env {env_id}" * (env_id != SITES)
-    command += f" --env-arguments '{json.dumps(options.env_kwargs)}'" * bool(options.env_kwargs)
-    command += _place_options(_places(options, {}))
     facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, _arguments(player, options))
     actor = AgentActor(make, facts)
-    player = Player(name.replace(":", "."), actor, env_id, kwargs, command, *_declared(agent), ours=False)
+    player = Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *_declared(agent), ours=False)
     return player
 
 
@@ -290,11 +282,6 @@ def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]
     return places
 
 
-def _place_options(kwargs: dict[str, Any]) -> str:
-    told = _without_folders(kwargs)
-    return "".join(f" --{name} {told[name]}" for name in (*PLACES, "split") if name in told)
-
-
 def policy_player(path: Path, options: ScoringOptions) -> Player:
     """A trained policy on its own environment, or on the scene and level of the options where it can play them.
 
@@ -314,23 +301,16 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     env_id = policy.description.env_id
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
     kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
-    command = f"surgsim evaluate --policy {_from_here(path)}"
-    # The level always, the scene where it is another than that of the training.
-    told = {name: value for name, value in kwargs.items() if name == "level" or value != own.get(name)}
     policy.reset(min(options.envs, len(options.played_seeds)))
 
     def check(env: gym.Env) -> None:
         policy.check_environment(env, f"policy {path}")
 
     return Player(
-        *(path.stem, policy, env_id, kwargs, command + _place_options(told)),
-        ours=_is_ours(path),
+        *(path.stem, policy, env_id, kwargs, ("--policy", str(_from_here(path)))),
+        ours=path.resolve().parent == policies_folder(),
         check=check,
     )
-
-
-def _is_ours(path: Path) -> bool:
-    return path.resolve().parent == policies_folder()
 
 
 def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
@@ -385,7 +365,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         env_id=env_id,
         env_kwargs=_without_folders(kwargs),
         seeds=tuple(seeds),
-        command=_with_options(player.command, options),
+        command=_command(player, options),
         wall_time=round(taken, 1),
         date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         physics_version=PHYSICS_VERSION,
@@ -398,7 +378,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     values = {name: figure.value for name, figure in result.figures.items()}
     printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
     figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
-    where = "not written (--results FOLDER or --submit FILE does)" if path is None else f"-> {path}"
+    where = "not written (--results FOLDER does)" if path is None else f"-> {path}"
     _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")
     return result
 
@@ -432,9 +412,6 @@ def _write(result: Result, player: Player, options: ScoringOptions) -> Path | No
 
     agents/results holds the project's own methods on the project's own scenes alone, as `ScoringOptions.standard` says.
     """
-    if options.submit is not None:
-        result.write(options.submit)
-        return options.submit
     if options.results is not None:
         return result.save(options.results)
     own_place = result.env_kwargs.get("scene") in (None, *list_scenes())
@@ -444,28 +421,22 @@ def _write(result: Result, player: Player, options: ScoringOptions) -> Path | No
 
 
 def print_comparison(one: str, other: str, options: ScoringOptions, console: Console) -> None:
-    """Print the differences of two methods, each a file, a method's name, or a name that training seeds share."""
-    groups = [_group(name, options) for name in (one, other)]
-    names = [Path(name).stem if name.endswith(".json") else name for name in (one, other)]
-    first, differences = groups[0][0], compare(groups[0], groups[1], np.random.default_rng(BOOTSTRAP_SEED))
+    """Print the differences of two results, each a file or a method's name."""
+    first, second = (_named_result(name, options) for name in (one, other))
     _say(
         console,
         f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap",
     )
-    for name, group in zip(names, groups, strict=True):
-        if len(group) > 1:
-            _say(console, f"{name}: mean over {len(group)} training seeds")
-    for difference in differences:
-        _say(console, describe(difference, *names))
+    for difference in compare(first, second, np.random.default_rng(BOOTSTRAP_SEED)):
+        _say(console, describe(difference, first.method, second.method))
 
 
-def _group(name: str, options: ScoringOptions) -> list[Result]:
-    """The results of a file or of a name: one, or one for each seed of a training."""
+def _named_result(name: str, options: ScoringOptions) -> Result:
+    """The result of a file, or of a method at the place of the options."""
     if name.endswith(".json"):
-        return [load_result(Path(name))]
-    folder = options.results or shipped_results()
-    wanted = _places(options, PLACES)
-    named = [one for one in load_results(folder) if name in (one.method, family(one.method))]
+        return load_result(Path(name))
+    folder, wanted = options.results or shipped_results(), _places(options, PLACES)
+    named = [one for one in load_results(folder) if name == one.method]
     # An environment without a choice of scene or level has neither.
     found = [
         one
@@ -475,50 +446,26 @@ def _group(name: str, options: ScoringOptions) -> list[Result]:
         and one.env_kwargs.get("split") == wanted.get("split")
         and one.motion == (options.motion or "")
     ]
-    if not found or len({one.place for one in found}) > 1:
-        places = ", ".join(sorted({one.place for one in named})) or "none"
+    if len(found) != 1:
+        places = ", ".join(sorted(one.place for one in named)) or "none"
         raise ValueError(
             f"{name!r} names {len(found)} results in {_from_here(folder)} at {wanted['scene']}, {wanted['level']}; it "
             f"has some at {places}: give --scene, --level and --motion, or a file"
         )
-    return found
+    return found[0]
 
 
-def write_reach(options: ScoringOptions, console: Console) -> None:
-    """Press over each lesion of the evaluation seeds, with and without it, and count those below the sensor's reach."""
-    from surgsim_env.palpation.scores import lesion_reaches
-
-    kwargs = _places(options, PLACES)
-    env: Any = gym.make(SITES, **kwargs).unwrapped
-    reaches = []
-    with StepProgress(console) as shown, shown.step("reach", total=len(options.played_seeds)) as ended:
-        for seed in options.played_seeds:
-            env.reset(seed=seed)
-            reaches += lesion_reaches(env.task.anatomy, env.task.drawn)
-            ended(1)
-    table = {
-        **_without_folders(kwargs),
-        "lesions": len(reaches),
-        "below": sum(reach.below for reach in reaches),
-        "noise": env.task.anatomy.scene.sensor.noise,
-        "differences": [round(reach.force - reach.force_without, 5) for reach in reaches],
-    }
-    _say(console, f"{table['below']} of {table['lesions']} lesions below reach")
-    ours = options.standard and kwargs["scene"] in list_scenes() and _checkout() is not None
-    folder = options.results or (shipped_results() if ours else None)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"reach_{place_name(SITES, kwargs)}.json"
-        path.write_text(json.dumps(table) + "\n", encoding="utf-8")
-        _say(console, f"-> {path}")
-
-
-def _with_options(command: str, options: ScoringOptions) -> str:
-    command += "" if options.all_seeds else f" --seeds {seeds_text(options.played_seeds)}"
-    command += "" if options.budget is None else f" --budget {options.budget}"
-    command += "" if options.motion is None else f" --motion {options.motion}"
-    command += " --no-tracking" * options.no_tracking
-    return command + ("" if options.dtype == "float32" else f" --dtype {options.dtype}")
+def _command(player: Player, options: ScoringOptions) -> str:
+    """The command that repeats a result: what is scored, and the options that change its figures."""
+    words = ["surgsim", "evaluate", *player.chosen_by]
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if option.name in ("envs", "threads", "results") or value == option.default:
+            continue
+        words.append(f"--{option.name.replace('_', '-')}")
+        if value is not True:
+            words.append(_from_here(Path(value)) if Path(str(value)).is_absolute() else str(value))
+    return shlex.join(words)
 
 
 def _without_folders(kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -43,8 +43,6 @@ class ScoringOptions:
     """Of the environment of --agent MODULE:CLASS, as a JSON object."""
     results: Path | None = None
     """Folder of result files; default: agents/results of a checkout."""
-    submit: Path | None = None
-    """Write the result into this file, and nowhere else."""
 
     def __post_init__(self) -> None:
         if self.split is not None and self.split not in SPLITS:

@@ -74,11 +74,6 @@ class Result:
     def save(self, folder: Path) -> Path:
         """Write it into a folder; replaces an older result of the same method and place."""
         path = folder / f"{self.place}_{self.method}.json"
-        self.write(path)
-        return path
-
-    def write(self, path: Path) -> None:
-        """Write it as a file."""
         table = asdict(self)
         table["seeds"] = seeds_text(self.seeds)
         table["figures"] = {
@@ -87,6 +82,7 @@ class Result:
         path.parent.mkdir(parents=True, exist_ok=True)
         lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
         path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+        return path
 
 
 def place_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
@@ -112,7 +108,7 @@ def shipped_results() -> Path:
 
 
 def load_result(path: Path) -> Result:
-    """Read a file of `Result.write`.
+    """Read a file of `Result.save`.
 
     Raises:
         ValueError: another content (names the file and what is wrong).
@@ -130,19 +126,8 @@ def load_result(path: Path) -> Result:
 
 
 def load_results(folder: Path) -> list[Result]:
-    """All results of a folder, by file name, without `reach_*.json`."""
-    return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
-
-
-def picture_name(result: Result) -> str:
-    """File name of the leaderboard's picture of a result's environment and scene."""
-    env_name = result.env_id.removeprefix("SurgSim/").removesuffix("-v0")
-    return "_".join(part for part in ("leaderboard", env_name, result.scene) if part) + ".png"
-
-
-def family(method: str) -> str:
-    """The name that policies of one configuration and several training seeds share: mine of mine_seed3."""
-    return re.sub(r"_seed\d+(?=_untracked$|$)", "", method)
+    """All results of a folder, by file name."""
+    return [load_result(path) for path in sorted(folder.glob("*.json"))]
 
 
 def read_seeds(text: str) -> tuple[int, ...]:

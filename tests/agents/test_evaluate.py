@@ -10,12 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
-from agents import leaderboard, leaderboard_tables
+from agents import leaderboard
 from surgsim_env.palpation.scores import ScoreEstimate
 from surgsim_env.scene.digest import PHYSICS_VERSION
 from surgsim_env.scene.load import scenes_folder
@@ -38,7 +36,7 @@ pytestmark = pytest.mark.agents
 
 def result(method: str, presses: float = 5.0, **changes: object) -> Result:
     figures = dict.fromkeys(
-        [name for _, name, _, _ in (*leaderboard_tables.PLACES, *leaderboard_tables.MAPS)],
+        [name for _, name, _, _ in (*leaderboard.PLACES, *leaderboard.MAPS)],
         ScoreEstimate(0.5, 0.25, math.inf),
     )
     figures |= {"hard_limit_share": ScoreEstimate(0.0, 0.0, 0.0), "fault_share": ScoreEstimate(0.01, 0.0, 0.02)}
@@ -74,12 +72,9 @@ def test_results_come_back_as_they_were(tmp_path: Path) -> None:
 def test_the_leaderboard_has_a_table_a_place_and_the_best_raster_alone(tmp_path: Path) -> None:
     for method, presses in (("gp_ucb", 4.0), ("raster_3", 6.0), ("raster_4", 9.0), ("middle", math.inf)):
         result(method, presses).save(tmp_path)
-    reach = {"scene": "phantom", "level": "hard", "lesions": 8, "below": 2}
-    (tmp_path / "reach_PalpateSites_phantom_hard.json").write_text(json.dumps(reach))
-    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
     text = (tmp_path / "board.md").read_text()
     assert text.count("## `SurgSim/PalpateSites-v0` phantom (hard)") == 1
-    assert "2 of 8 lesions (25%)" in text
     rows = [line.split("|")[1:3] for line in text.splitlines() if line.startswith("| ")]
     named = [(name.strip(), presses.strip()) for name, presses in rows]
     assert ("raster 3 x 3", "6") in named and ("middle", "never") in named
@@ -89,35 +84,6 @@ def test_the_leaderboard_has_a_table_a_place_and_the_best_raster_alone(tmp_path:
     assert order.index("gp_ucb") < order.index("raster 3 x 3") < order.index("middle")
     # Every file's command is there, that of the raster which is not shown too.
     assert "--agent raster_4`" in text
-
-
-def test_the_leaderboard_shows_a_picture_a_scene(tmp_path: Path) -> None:
-    """All levels of a scene in one; what never comes, what none has and who estimates by itself can be drawn too."""
-    made = [
-        *(result(method, presses) for method, presses in (("gp_ucb", 4.0), ("raster_3", 6.0), ("random", math.inf))),
-        result("sites_ppo", env_kwargs={"scene": "phantom", "level": "easy"}, command="... --policy sites_ppo ..."),
-        result("gp_ucb", env_kwargs={"scene": "liver", "level": "easy"}),
-        result("middle", env_kwargs={"scene": "phantom_wide"}, own_estimate=True),
-        result("oracle_retract", env_id="SurgSim/Retract-v0", env_kwargs={}, sees_truth=True),
-    ]
-    made[-1].figures["seconds"] = ScoreEstimate(None, None, None)
-    for one in made:
-        one.save(tmp_path)
-    pictures = leaderboard.draw_leaderboard(load_results(tmp_path), tmp_path)
-    names = {"leaderboard_PalpateSites_phantom.png", "leaderboard_PalpateSites_liver.png", "leaderboard_Retract.png"}
-    assert {picture.name for picture in pictures} == names
-    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
-    shown = re.findall(r"!\[.*\]\(../docs/images/(.*)\)", (tmp_path / "board.md").read_text())
-    assert sorted(shown) == sorted(names)
-    assert imread(pictures[0]).std() > 0.05
-    kinds = {one.method: leaderboard.kind(one) for one in made}
-    assert kinds["sites_ppo"] == "learned" and kinds["gp_ucb"] == "searches by belief"
-    assert kinds["random"] == "scripted" and kinds["oracle_retract"] == "sees the truth"
-
-
-def test_the_pictures_of_the_leaderboard_are_there() -> None:
-    shown = re.findall(r"!\[.*\]\(../docs/images/(.*)\)", leaderboard.LEADERBOARD.read_text(encoding="utf-8"))
-    assert shown and all((leaderboard.IMAGES / name).is_file() for name in shown)
 
 
 def test_results_are_of_this_physics_and_name_policies_that_are_there() -> None:
@@ -155,7 +121,7 @@ def test_who_sees_the_truth_scores_all_of_it_on_the_environment(tmp_path: Path) 
     assert figures["middle"]["error_mm"].value > 5.0
     marks = {made.method: (made.sees_truth, made.own_estimate) for made in load_results(tmp_path)}
     assert marks == {"truth": (True, True), "middle": (False, True)}
-    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
     assert "| truth **sees truth** (own estimate) |" in (tmp_path / "board.md").read_text()
 
 
@@ -174,13 +140,13 @@ def test_oracles_play_a_patient_who_moves(tmp_path: Path) -> None:
     assert sites.command.endswith("--budget 7 --motion calm --no-tracking")
     assert sites.sees_truth and task.sees_truth and task.successes == [True]
     assert 0.0 <= sites.figures["success"].value <= 1.0
-    leaderboard_tables.write_leaderboard(tmp_path, tmp_path / "board.md")
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
     assert "(standard, motion calm)" in (tmp_path / "board.md").read_text()
 
 
 def test_wrong_options_are_refused() -> None:
     for arguments, message in (
-        ([], "give one of --agent, --policy, --all, --reach, --compare; given: none"),
+        ([], "give one of --agent, --policy, --all, --compare; given: none"),
         (["--agent", "gp_ucb", "--all"], "given: --agent and --all"),
         (["--agent", "gp_ucb", "--split", "tset"], "it is one of train, validation, test"),
         (["--agent", "my:Own", "--env-arguments", "[1]"], "it must be a JSON object"),
@@ -189,7 +155,6 @@ def test_wrong_options_are_refused() -> None:
         (["--agent", "gp_ucb", "--seeds", "9:5"], "FIRST is at most LAST"),
         (["--agent", "gp_ucb", "--seeds", "1,x"], "the rule is FIRST:LAST, both included, or a list"),
         (["--agent", "gp_ucb", "--envs", "0"], "--envs is 0; it must be at least 1"),
-        (["--all", "--submit", "all.json"], "--submit writes one result"),
         (
             ["--agent", "gp_ucb", "--env", "SurgSim/Palpate-v0"],
             "--env and --env-arguments are for --agent MODULE:CLASS",
@@ -240,7 +205,7 @@ def test_results_of_other_seeds_are_not_written_by_themselves(
         ["--agent", "surgsim_env.scoring.site_search:RandomSites", "--episodes", "1"],
     ):
         surgsim("evaluate", *arguments, *common)
-        assert "not written (--results FOLDER or --submit FILE does)" in capsys.readouterr().out
+        assert "not written (--results FOLDER does)" in capsys.readouterr().out
     assert not (tmp_path / "ours").exists()
     monkeypatch.setattr("surgsim_env.scoring.options.EVALUATION_SEEDS", range(1_000_000, 1_000_001))
     own_scene = shutil.copy(scenes_folder() / "organs" / "phantom_small.toml", tmp_path)
@@ -285,22 +250,6 @@ def test_a_family_is_scored_on_its_test_split(tmp_path: Path) -> None:
             split(mine, scene="phantom", env_arguments=named)
 
 
-def test_reach_counts_no_lesion_where_there_is_none(tmp_path: Path) -> None:
-    env = gym.make(SITES, scene="phantom_small", level="standard").unwrapped
-    env.reset(seed=(seed := next(seed for seed in range(100) if not drawn_lesions(env, seed))))
-    scene = shutil.copy(scenes_folder() / "organs" / "phantom_small.toml", tmp_path / "own.toml")
-    surgsim("evaluate", "--reach", "--scene", str(scene), "--seeds", str(seed), "--results", str(tmp_path / "out"))
-    table = json.loads((tmp_path / "out" / "reach_PalpateSites_own_standard.json").read_text())
-    assert (table["lesions"], table["below"], table["scene"]) == (0, 0, "own.toml")
-    with pytest.raises(ValueError, match="leave out --motion"):
-        surgsim("evaluate", "--reach", "--motion", "calm")
-
-
-def drawn_lesions(env: Any, seed: int) -> int:
-    env.reset(seed=seed)
-    return len(env.task.truth)
-
-
 def test_all_methods_are_those_that_the_place_suits(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch", reason="needs the `agents` extra")
     played: list[str] = []
@@ -333,27 +282,28 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_a_strangers_result_is_submitted(module: Path) -> None:
     name = ["--agent", "strangers_agent:Middle", "--scene", "phantom_small", "--seeds", "3:4", "--budget", "2"]
-    surgsim("evaluate", *name, "--submit", "mine.json")
-    made = load_result(Path("mine.json"))
+    surgsim("evaluate", *name, "--results", "mine")
+    (file,) = Path("mine").iterdir()
+    made = load_result(file)
     assert made.method == "strangers_agent.Middle" and made.place == "PalpateSites_phantom_small_standard"
-    assert str(module.parent) not in Path("mine.json").read_text()
+    assert str(module.parent) not in file.read_text()
     Path("broken.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ValueError, match=r"broken.json is no result of surgsim evaluate"):
-        surgsim("evaluate", "--compare", "mine.json", "broken.json")
+        surgsim("evaluate", "--compare", str(file), "broken.json")
 
 
 def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """By names among the results at a place, with a training's seeds under the name they share; or by files."""
+    """By names among the results at a place, or by files."""
     errors = [[20.0, 1.0], [9.0, 9.0]]
-    for method, rows in (("one", errors), ("ppo_seed0", errors), ("ppo_seed1", [[1.0, 1.0], [1.0, 1.0]])):
+    for method, rows in (("one", errors), ("ppo", [[1.0, 1.0], [1.0, 1.0]])):
         wins = [row[-1] <= 5.0 for row in rows]
         result(method, errors_mm=rows, successes=wins, lesion_counts=[1, 1], budget=2).save(tmp_path)
     surgsim("evaluate", "--compare", "one", "ppo", "--level", "hard", "--results", str(tmp_path))
     printed = capsys.readouterr().out
-    assert "ppo: mean over 2 training seeds" in printed and "success: one 50, ppo 75 %; difference -25" in printed
-    files = [str(tmp_path / f"PalpateSites_phantom_hard_{name}.json") for name in ("one", "ppo_seed1")]
+    assert "success: one 50, ppo 100 %; difference -50" in printed
+    files = [str(tmp_path / f"PalpateSites_phantom_hard_{name}.json") for name in ("one", "ppo")]
     surgsim("evaluate", "--compare", *files)
-    assert "success: PalpateSites_phantom_hard_one 50" in capsys.readouterr().out
+    assert printed == capsys.readouterr().out
     with pytest.raises(ValueError, match=r"'one' names 0 results in .* at phantom, standard; it has some at .*_hard"):
         surgsim("evaluate", "--compare", "one", "ppo", "--results", str(tmp_path))
 
@@ -377,11 +327,9 @@ def test_a_policy_does_not_play_what_it_was_not_made_for(policy: str, options: l
 def test_level_and_motion_beside_a_policy_are_honoured(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the `agents` extra")
     path = policies_folder() / "sites_evolved.json"
-    common = ["--policy", str(path), "--seeds", "3", "--submit", str(tmp_path / "mine.json")]
+    common = ["--policy", str(path), "--seeds", "3", "--results", str(tmp_path)]
     surgsim("evaluate", *common, "--level", "easy", "--motion", "calm", "--scene", "phantom")
-    made = load_result(tmp_path / "mine.json")
+    (made,) = load_results(tmp_path)
     assert (made.scene, made.env_kwargs["level"], made.motion) == ("phantom", "easy", "calm")
-    assert set(made.origin["agent"]) == {path.name}
-    assert made.command == (
-        "surgsim evaluate --policy agents/policies/sites_evolved.json --level easy --seeds 3 --motion calm"
-    )
+    place = "--scene phantom --level easy --motion calm --seeds 3"
+    assert made.command == f"surgsim evaluate --policy agents/policies/sites_evolved.json {place}"

@@ -16,24 +16,20 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import one_line_errors
-
-with one_line_errors(__name__, "agents"):
-    import torch
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
-    from stable_baselines3.common.logger import configure
-    from stable_baselines3.common.utils import LinearSchedule
-    from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
-
-    from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
-    from surgsim_env.training.curriculum import RepeatedAction, Stage, StagedRewards
-    from surgsim_env.training.palpate_surrogate import PalpateSurrogate
-    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, save_policy
-    from surgsim_env.training.policy_network import NetworkLayout, actor_of
-    from surgsim_env.training.touch_features import TouchSummary
+from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env.training.curriculum import RepeatedAction, Stage, StagedRewards
+from surgsim_env.training.palpate_surrogate import PalpateSurrogate
+from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, save_policy
+from surgsim_env.training.policy_network import NetworkLayout, actor_of
+from surgsim_env.training.touch_features import TouchSummary
 
 ENVS, REPEAT = 16, 5
 # Of each periodic evaluation.
@@ -201,5 +197,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents"):
-        main()
+    main()

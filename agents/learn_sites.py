@@ -29,30 +29,26 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
+import cma
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.special import expit
 
-from agents.command_line import one_line_errors
-
-with one_line_errors(__name__, "agents"):
-    import cma
-    import torch
-    from scipy.special import expit
-
-    from surgsim_env.palpation.chart import MAP_SIDE
-    from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
-    from surgsim_env.training.acquisition import Acquisition
-    from surgsim_env.training.policy_files import (
-        PolicyDescription,
-        load_policy,
-        observation_declaration,
-        policy_path,
-        save_policy,
-    )
-    from surgsim_env.training.recorded_faces import load_faces
-    from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
-    from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
+from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
+from surgsim_env.training.acquisition import Acquisition
+from surgsim_env.training.policy_files import (
+    PolicyDescription,
+    load_policy,
+    observation_declaration,
+    policy_path,
+    save_policy,
+)
+from surgsim_env.training.recorded_faces import load_faces
+from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
+from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
 # From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.
@@ -261,5 +257,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents"):
-        main()
+    main()

@@ -1,4 +1,4 @@
-"""Record episodes of an oracle, an agent, a trained policy or a person as a Minari or LeRobot data set.
+"""Record episodes of an oracle, an agent or a trained policy as a Minari or LeRobot data set.
 
     python -m agents.record_demonstrations SurgSim/Retract-v0 --episodes 100 --dataset surgsim/retract/oracle-v0
     python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
@@ -10,7 +10,7 @@ With `--format lerobot` the data set is the folder `--dataset` (`agents/lerobot_
 
 Minari's datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored
 with its seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations
-to the bit. A person plays with `--by keyboard` (`agents/keyboard.py`). `Recorder` records any other code that steps an
+to the bit. `Recorder` records any other code that steps an
 environment:
 
     env = Recorder(gym.make("SurgSim/Palpate-v0"))
@@ -28,12 +28,15 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import minari
 import numpy as np
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from minari.dataset.minari_dataset import parse_dataset_id
+from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import one_line_errors
-from agents.keyboard import Keyboard
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
@@ -44,13 +47,6 @@ from surgsim_env.scoring.results import SITES
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.scripting.observations import stacked_observations
 from surgsim_env.training.site_agent import site_facts
-
-with one_line_errors(__name__, "agents", "demonstrations"):
-    import minari
-    from minari.data_collector.episode_buffer import EpisodeBuffer
-    from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.storage.datasets_root_dir import get_dataset_path
-    from tqdm import tqdm
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".json", ".safetensors")
@@ -152,7 +148,7 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     """The player of a name.
 
     Args:
-        by: "oracle", "keyboard", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
+        by: "oracle", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
         env: where it plays, made with gym.make.
         env_arguments: of the environment, as an agent is told them; without those of the recording's pictures.
 
@@ -161,9 +157,6 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     """
     if by == "oracle":
         return play_oracle
-    if by == "keyboard":
-        keyboard = Keyboard(env)
-        return lambda env, seed: play_actor(env, seed, keyboard)
     if by.endswith(POLICY_SUFFIXES):
         from surgsim_env.training.policy_files import load_policy
 
@@ -172,7 +165,7 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
         policy.reset(1)
         return lambda env, seed: play_actor(env, seed, policy)
     if ":" not in by:
-        raise ValueError(f"--by is {by!r}; the rule is oracle, keyboard, a policy's NAME.json or MODULE:CLASS")
+        raise ValueError(f"--by is {by!r}; the rule is oracle, a policy's NAME.json or MODULE:CLASS")
     make, _ = strangers_agent(by, "--by")
     assert env.spec is not None
     env_id = env.spec.id
@@ -197,7 +190,7 @@ def record(
 ) -> Iterator[RecordedEpisode]:
     """Play an episode for each seed; yields those that succeeded, or all.
 
-    Ctrl-C, and a person who closes the window, end it with the episodes that were played to their end.
+    Ctrl-C ends it with the episodes that were played to their end.
 
     Raises:
         ValueError: seeds that are reserved for scores.
@@ -293,7 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
-    parser.add_argument("--by", default="oracle", help="oracle, keyboard, a policy's NAME.json, or MODULE:CLASS")
+    parser.add_argument("--by", default="oracle", help="oracle, a policy's NAME.json, or MODULE:CLASS")
     parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
@@ -356,5 +349,4 @@ def _record_lerobot(given: argparse.Namespace, who: str) -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents", "demonstrations"):
-        main()
+    main()

@@ -8,7 +8,6 @@ Of `liver_family`, 128 faces take 80 to 120 minutes of processor time.
 import argparse
 from pathlib import Path
 
-from agents.command_line import one_line_errors
 from surgsim_env.training.recorded_faces import LANES, record_faces
 
 
@@ -32,5 +31,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__):
-        main()
+    main()

@@ -30,8 +30,6 @@ RENDER_MODES = ("human", "rgb_array")
 TURN, ZOOM = 0.008, 0.9
 # Smallest angle between the view and the vertical [rad].
 POLE = 0.05
-# Keys that a task may read; GLFW's code of a key is that of its letter.
-PLAYING_KEYS = "ADEFQRSW "
 
 
 def require_display() -> None:
@@ -107,13 +105,6 @@ class Window:
         glfw.swap_buffers(handle)
         time.sleep(max(0.0, self._next - time.monotonic()))
         self._next = max(self._next, time.monotonic() - self._period) + self._period
-
-    def held_keys(self) -> str:
-        """Capital letters and space of the keys that were held down at the last picture; none in a closed window."""
-        glfw, handle = self._context._glfw, self._context.handle
-        if self.closed:
-            return ""
-        return "".join(key for key in PLAYING_KEYS if glfw.get_key(handle, ord(key)) == glfw.PRESS)
 
     def close(self) -> None:
         """Close the window; may be called more than once."""

@@ -1,25 +1,21 @@
-"""The scripts in agents/ run and do what they say."""
-
-import sys
-from pathlib import Path
+"""Agents play and learn."""
 
 import gymnasium as gym
 import pytest
 
 import surgsim_env  # noqa: F401
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "agents"))
+from surgsim_env.scoring.results import load_results
+from tests.agents.commands import surgsim
 
 
 @pytest.mark.slow
-def test_raster_agent_finds_the_lesion():
-    import raster
-
-    env = gym.make("SurgSim/Palpate-v0")
-    record = raster.run_episode(env, raster.RasterAgent(), seed=1)
-    assert record["declared"] and record["success"]
-    assert record["error_mm"] < 5.0
-    assert record["return"] > 7.0
+def test_raster_agent_finds_the_lesion(tmp_path):
+    place = ["--env", "SurgSim/Palpate-v0", "--scene", "phantom", "--seeds", "1", "--results", str(tmp_path)]
+    surgsim("evaluate", "--agent", "agents.raster:RasterAgent", *place)
+    (result,) = load_results(tmp_path)
+    assert result.figures["success"].value == 1.0
+    assert result.figures["error_mm"].value < 5.0
+    assert result.figures["return"].value > 7.0
 
 
 @pytest.mark.agents

@@ -28,12 +28,14 @@ class Difference:
         figure: a name of SHOWN
         one, other: the figure of each
         difference: one - other, with its interval; draws in which neither reaches the line are left out
+        ratio: one / other of presses, with its interval; None of other figures
     """
 
     figure: str
     one: float
     other: float
     difference: ScoreEstimate
+    ratio: ScoreEstimate | None
 
 
 def compare(one: Result, other: Result, rng: np.random.Generator) -> list[Difference]:
@@ -59,14 +61,19 @@ def compare(one: Result, other: Result, rng: np.random.Generator) -> list[Differ
 
 def _difference(name: str, of: Figure, one: Result, other: Result, draws: list[NDArray[np.intp]]) -> Difference:
     everyone = np.arange(len(one.seeds))
-    # Never less never is undefined: NaN.
-    differences = np.array([of(one, chosen) - of(other, chosen) for chosen in draws])
-    values = of(one, everyone), of(other, everyone)
-    return Difference(name, *values, figure_with_interval(values[0] - values[1], differences))
+    value, other_value = of(one, everyone), of(other, everyone)
+    values = np.array([(of(one, chosen), of(other, chosen)) for chosen in draws])
+    ratio = None
+    # Never less never, and never over never, is undefined: NaN.
+    with np.errstate(invalid="ignore"):
+        difference = figure_with_interval(value - other_value, values[:, 0] - values[:, 1])
+        if name == "presses_to_median":
+            ratio = figure_with_interval(float(np.divide(value, other_value)), values[:, 0] / values[:, 1])
+    return Difference(name, value, other_value, difference, ratio)
 
 
 def describe(difference: Difference, one: str, other: str) -> str:
-    """One line: both figures and their difference."""
+    """One line: both figures, their difference, and the ratio where there is one."""
     heading, digits, factor, unit = SHOWN[difference.figure]
 
     def shown(value: float | None, form: str = "") -> str:
@@ -75,7 +82,10 @@ def describe(difference: Difference, one: str, other: str) -> str:
     of = difference.difference
     interval = f"{shown(of.value, '+')} ({shown(of.low, '+')} to {shown(of.high, '+')})"
     values = f"{one} {shown(difference.one)}, {other} {shown(difference.other)}{unit}"
-    return f"{heading}: {values}; difference {interval}{unit}"
+    line = f"{heading}: {values}; difference {interval}{unit}"
+    if difference.ratio is None or difference.ratio.value is None:
+        return line
+    return f"{line}; ratio {difference.ratio.value:.2f} ({difference.ratio.low:.2f} to {difference.ratio.high:.2f})"
 
 
 def _faults(one: Result, other: Result) -> Iterator[str]:

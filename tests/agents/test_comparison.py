@@ -54,7 +54,7 @@ def test_a_method_that_takes_two_presses_more_in_every_episode():
     first, error, success = compare(one, other, np.random.default_rng(0))
     assert first.figure == "presses_to_median" and first.difference == ScoreEstimate(-2.0, -2.0, -2.0)
     assert error.difference == success.difference == ScoreEstimate(0.0, 0.0, 0.0)
-    assert "difference -2.0 (-2.0 to -2.0)" in describe(first, "one", "other")
+    assert "difference -2.0 (-2.0 to -2.0); ratio 0." in describe(first, "one", "other")
 
 
 def test_the_interval_of_a_share_is_that_of_the_paired_binomial():

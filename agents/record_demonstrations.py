@@ -1,8 +1,7 @@
 """Record episodes of an oracle, an agent or a trained policy as a Minari or LeRobot data set.
 
     python -m agents.record_demonstrations SurgSim/Retract-v0 --episodes 100 --dataset surgsim/retract/oracle-v0
-    python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
-        --dataset surgsim/palpate/raster-v0
+    python -m agents.record_demonstrations SurgSim/Palpate-v0 --by my_agent:Descend --dataset surgsim/palpate/mine-v0
     python -m agents.record_demonstrations SurgSim/Palpate-v0 --format lerobot --dataset runs/palpate --episodes 100 \
         --images endoscope --keep-failures
 
@@ -22,7 +21,7 @@ import argparse
 import copy
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,6 @@ import gymnasium as gym
 import minari
 import numpy as np
 from minari.data_collector.episode_buffer import EpisodeBuffer
-from minari.dataset.minari_dataset import parse_dataset_id
 from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -41,12 +39,10 @@ from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.scene.digest import PHYSICS_VERSION
-from surgsim_env.scoring.episodes import AgentActor, EpisodeActor, agent_generator, episode_facts
-from surgsim_env.scoring.evaluate import strangers_agent
-from surgsim_env.scoring.results import SITES
+from surgsim_env.scoring.episodes import EpisodeActor, agent_generator
+from surgsim_env.scoring.evaluate import strangers_actor
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.scripting.observations import stacked_observations
-from surgsim_env.training.site_agent import site_facts
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".json", ".safetensors")
@@ -166,10 +162,8 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
         return lambda env, seed: play_actor(env, seed, policy)
     if ":" not in by:
         raise ValueError(f"--by is {by!r}; the rule is oracle, a policy's NAME.json or MODULE:CLASS")
-    make, _ = strangers_agent(by, "--by")
     assert env.spec is not None
-    env_id = env.spec.id
-    actor = AgentActor(make, site_facts if env_id == SITES else lambda one: episode_facts(one, env_id, env_arguments))
+    actor = strangers_actor(by, "--by", env.spec.id, env_arguments)
     return lambda env, seed: play_actor(env, seed, actor)
 
 
@@ -195,7 +189,9 @@ def record(
     Raises:
         ValueError: seeds that are reserved for scores.
     """
-    check_seeds(seeds)
+    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
+    if kept is not None:
+        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
     recorder, success_count = Recorder(env, read), 0
     with tqdm(seeds, unit="episode") as progress:
         for index, seed in enumerate(progress):
@@ -208,37 +204,6 @@ def record(
             success_count += sum(episode.success for episode in recorder.episodes)
             progress.set_postfix(success=f"{success_count / (index + 1):.0%}")
             yield from (episode for episode in recorder.episodes if keep_failures or episode.success)
-
-
-def check_seeds(seeds: Iterable[int]) -> None:
-    """Refuse seeds that are reserved for scores.
-
-    Raises:
-        ValueError: names the first.
-    """
-    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
-    if kept is not None:
-        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
-
-
-def check_dataset_name(name: str) -> None:
-    """Check that a Minari data set of this name can be written.
-
-    Raises:
-        ValueError: a name that Minari does not take, or one that is taken.
-    """
-    try:
-        parse_dataset_id(name)
-    # Without a version Minari raises a TypeError.
-    except (ValueError, TypeError):
-        raise ValueError(
-            f"--dataset is {name!r}; the rule of Minari is NAME-vNUMBER or SPACE/NAME-vNUMBER, of letters, digits, _ "
-            "and -, SPACE of at least two"
-        ) from None
-    if get_dataset_path(name).exists():
-        raise ValueError(
-            f"--dataset {name} is there already ({get_dataset_path(name)}): raise its version, or remove it"
-        )
 
 
 def write_dataset(
@@ -256,12 +221,11 @@ def write_dataset(
         author: of the dataset.
 
     Raises:
-        ValueError: no episode, an environment that was not made with gym.make, or a name that is taken.
+        ValueError: no episode, or a name that is taken.
     """
     if not episodes:
         raise ValueError("there is no episode to write: none was played, or none succeeded (--keep-failures)")
-    if env.spec is None:
-        raise ValueError("the environment has no spec, so the dataset could not recover it: make it with gym.make")
+    assert env.spec is not None
     # The dataset may be used on a machine without a display.
     spec = copy.deepcopy(env.spec)
     spec.kwargs.pop("render_mode", None)
@@ -304,7 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if given.images:
         raise ValueError("--images is for --format lerobot: add it, or leave --images out")
-    check_dataset_name(given.dataset)
+    if get_dataset_path(given.dataset).exists():
+        raise ValueError(f"--dataset {given.dataset} is there already: raise its version, or remove it")
     env = gym.make(given.env, **given.env_arguments)
     dataset = write_dataset(list(_episodes(given, env)), env, given.dataset, algorithm_name=who)
     print(

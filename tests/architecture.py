@@ -40,7 +40,7 @@ ORDER = {
     ),
     # One script each.
     "agents": (
-        *("__init__", "raster", "record_faces", "learn_from_scratch"),
+        *("__init__", "record_faces", "learn_from_scratch"),
         *("learn_palpate_organs", "learn_retract", "learn_sites"),
         *(
             "envhub",

@@ -11,7 +11,6 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
@@ -89,22 +88,12 @@ def play(
     Args:
         actor: what plays. An episode's record does not depend on the others where the actor's actions do not: those
             of an `EpisodeActor` may draw from the random numbers of each episode.
-        envs: with autoreset_mode="Disabled", so that each reset has its seed.
+        envs: of `make_envs`.
         seeds: of the episodes.
         begin: makes the record of an episode from the index of its environment and its seed.
         progress: called after each step with the number of episodes that ended.
-
-    Raises:
-        ValueError: another autoreset mode, or several environments that cannot be paused.
     """
-    mode, lanes = AutoresetMode(envs.metadata["autoreset_mode"]), envs.unwrapped
-    if mode is not AutoresetMode.DISABLED:
-        raise ValueError(f'autoreset_mode is {mode.value!r}; episodes of given seeds need "Disabled"')
-    if envs.num_envs > 1 and not hasattr(lanes, "pause"):
-        raise ValueError(
-            f"{envs.num_envs} environments of {type(lanes).__name__} cannot be paused where no seed is left: make them "
-            'with vectorization_mode="vector_entry_point"'
-        )
+    lanes = envs.unwrapped
     waiting, records = list(range(len(seeds))), dict[int, R]()
     playing: list[int | None] = [None] * envs.num_envs
     observations, begins = np.zeros(0), np.ones(envs.num_envs, dtype=np.bool_)
@@ -239,13 +228,8 @@ class AgentActor:
         self._idle = np.zeros(0, dtype=np.float32)
 
     def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
-        """Make the agent of an episode in environment `index`.
-
-        Raises:
-            ValueError: it is refused by `check_agent`.
-        """
+        """Make the agent of an episode in environment `index`."""
         agent = self.agents[index] = self.make()
-        check_agent(agent, f"agent {type(agent).__name__}")
         self._idle = np.zeros(env.action_space.shape, dtype=np.float32)
         agent.reset(rng, self.facts(env))
         if sees_truth(agent):
@@ -422,16 +406,8 @@ class SiteRecord:
         )
 
     def _own_places(self) -> NDArray[np.float64]:
-        """The agent's own estimate; a ValueError where it is no list of places."""
-        said = np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64)
-        if said.size == 0:
-            return np.zeros((0, 3))
-        if said.ndim != 2 or said.shape[1] != 3 or not np.isfinite(said).all():
-            raise ValueError(
-                f"agent {type(self.reference).__name__}: estimate gives {said.tolist()!r:.60}, shape {said.shape}; "
-                "the rule is places on the face [m], finite, shape (k, 3)"
-            )
-        return said
+        """The agent's own estimate."""
+        return np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64).reshape(-1, 3)
 
     def _own_map(self, made: MapScore) -> MapScore:
         """The agent's own map beside the truth, which only one that declares it sees."""

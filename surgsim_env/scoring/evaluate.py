@@ -52,7 +52,7 @@ from surgsim_env.scoring.results import (
     shipped_results,
 )
 from surgsim_env.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
-from surgsim_env.training.site_agent import SiteAgent, site_facts
+from surgsim_env.training.site_agent import site_facts
 
 # Seed of the bootstrap.
 BOOTSTRAP_SEED = 0
@@ -167,21 +167,20 @@ def named_class(text: str, option: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise
-        raise ValueError(
-            f"{option} {text}: there is no module {error.name!r} on Python's path: run from its folder, or add that to "
-            "PYTHONPATH"
-        ) from None
+        raise ValueError(f"{option} {text}: there is no module {error.name!r} on Python's path") from None
     if not callable(getattr(found, name, None)):
-        raise ValueError(f"{option} {text}: {found.__file__ or module} has no class {name!r}")
+        raise ValueError(f"{option} {text}: {module} has no class {name!r}")
     return getattr(found, name)
 
 
-def strangers_agent(text: str, option: str) -> tuple[Callable[[], Any], Any]:
-    """What makes the agents of MODULE:CLASS, and one of them.
+def strangers_actor(text: str, option: str, env_id: str, env_kwargs: dict[str, Any]) -> AgentActor:
+    """The actor of the agents of MODULE:CLASS.
 
     Args:
         text: MODULE:CLASS.
         option: where it was given, for messages.
+        env_id: of the environment that it plays.
+        env_kwargs: of the environment, as an agent is given them.
 
     Raises:
         ValueError: as in `named_class` and `check_agent`, or it cannot be made without arguments.
@@ -192,18 +191,7 @@ def strangers_agent(text: str, option: str) -> tuple[Callable[[], Any], Any]:
     except TypeError as error:
         raise ValueError(f"{option} {text}: it is made without arguments, and that failed: {error}") from None
     check_agent(agent, f"{option} {text}: it")
-    return make, agent
-
-
-def find_agent(name: str) -> Callable[[], SiteAgent]:
-    """The factory of the site search with a name.
-
-    Raises:
-        ValueError: an unknown name (lists the known).
-    """
-    if name not in AGENTS:
-        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
-    return AGENTS[name]
+    return AgentActor(make, site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, env_kwargs))
 
 
 def evaluate_all(options: ScoringOptions, console: Console) -> None:
@@ -241,7 +229,9 @@ def find_player(name: str, options: ScoringOptions) -> Player:
         script = TASK_AGENTS[name]
         kwargs = _places(options, PLACES if script.has_places else {}) | script.kwargs
         return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by)
-    make, kwargs = find_agent(name), _places(options, PLACES)
+    if name not in AGENTS:
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
+    make, kwargs = AGENTS[name], _places(options, PLACES)
     if name in REFERENCES:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
@@ -249,7 +239,6 @@ def find_player(name: str, options: ScoringOptions) -> Player:
 
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
-    make, agent = strangers_agent(name, "--agent")
     env_id = options.env or SITES
     for argument in (*PLACES, "split", "motion", "budget"):
         if argument in options.env_kwargs and getattr(options, argument) is not None:
@@ -257,10 +246,10 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
     # A split that --env-arguments name is meant.
     kwargs = {**_places(options, own), **options.env_kwargs}
-    facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, _arguments(player, options))
-    actor = AgentActor(make, facts)
-    player = Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *_declared(agent), ours=False)
-    return player
+    given = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
+    actor = strangers_actor(name, "--agent", env_id, given)
+    declared = _declared(actor.make())
+    return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, ours=False)
 
 
 def _declared(agent: Any) -> tuple[bool, bool]:

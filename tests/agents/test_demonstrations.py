@@ -258,13 +258,9 @@ def test_a_class_that_is_no_agent_is_refused():
         player(f"{__name__}:OfEnvironment", env, {})
 
 
-def test_a_name_that_minari_refuses_is_refused_before_anything_is_played(folder, dataset, monkeypatch):
+def test_a_name_that_is_taken_is_refused_before_anything_is_played(folder, dataset, monkeypatch):
     from agents import record_demonstrations
 
     monkeypatch.setattr(record_demonstrations, "record", None)
-    for name, said in (
-        *((name, f"--dataset is '{name}'; the rule of Minari is NAME-v") for name in ("palpate", "a b-v0", "x/y-v0")),
-        (NAME, f"--dataset {NAME} is there already"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            record_demonstrations.main(["SurgSim/Palpate-v0", "--dataset", name])
+    with pytest.raises(ValueError, match=f"--dataset {NAME} is there already"):
+        record_demonstrations.main(["SurgSim/Palpate-v0", "--dataset", NAME])

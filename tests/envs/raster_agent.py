@@ -1,9 +1,7 @@
 """A scripted agent for SurgSim/Palpate-v0: press a raster, go back to the stiffest place, declare it.
 
 It uses the observation (tip position, force) and the scene file (height of the phantom, force limits) only, so a
-learning agent should beat its score. From a checkout:
-
-    surgsim evaluate --agent agents.raster:RasterAgent --env SurgSim/Palpate-v0 --scene phantom --seeds 0:4
+learning agent should beat its score.
 """
 
 from collections.abc import Iterator

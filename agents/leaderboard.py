@@ -76,7 +76,7 @@ shown are the best of those tried, by presses to 5 mm, then by the error over al
 **sees truth** know what is hidden: `truth` reports it, the oracles press with that knowledge. Where the patient moves,
 presses and oracles track the surface by markers; methods whose name ends in `untracked` press at the rest position.
 How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
-`surgsim evaluate --compare A B`, for results of one version of the physics.
+`surgsim evaluate --compare A.json B.json`, for results of one version of the physics.
 """
 
 

@@ -23,8 +23,8 @@ class Evaluate:
     """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
-    compare: tuple[str, str] | None = None
-    """Two methods of --results on this scene and level, or two files."""
+    compare: tuple[Path, Path] | None = None
+    """Result files of two methods on the same episodes."""
     played: ScoringOptions = field(default_factory=ScoringOptions)
 
     def run(self, console: Console) -> int:
@@ -52,5 +52,5 @@ class Evaluate:
             elif self.all:
                 evaluate.evaluate_all(options, console)
             elif self.compare is not None:
-                evaluate.print_comparison(*self.compare, options, console)
+                evaluate.print_comparison(*self.compare, console)
         return 0

@@ -29,7 +29,7 @@ from surgsim_env.palpation.contrast_map import (
     score_map,
 )
 from surgsim_env.palpation.hold import Hold, hold_of
-from surgsim_env.palpation.misses import HEALTHY_FEWEST, Miss, PressedSites, explain_misses
+from surgsim_env.palpation.misses import HEALTHY_FEWEST, Miss, explain_misses
 from surgsim_env.palpation.press import Press, scan
 from surgsim_env.palpation.truth import Truth, seen_from_surface
 from surgsim_env.scene.anatomy import SUPPORT_TIP_RADII, Anatomy
@@ -157,7 +157,8 @@ def run_palpation(
             hidden,
             truths,
             maps,
-            PressedSites(sites[used], sites[~used], scene.palpation.site_spacing),
+            sites[used],
+            sites[~used],
             progress=lambda count: progress_task(bar, "over missed lesions", count),
         )
     return PalpationResult(
@@ -435,8 +436,6 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not "
         f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N"
     )
-    for index in np.flatnonzero(~palpation.used).tolist():
-        console.print(f"  site {index} ended early: {early_end(palpation, index)}")
 
 
 def _touch(palpation: PalpationResult) -> tuple[float, float, float, float]:

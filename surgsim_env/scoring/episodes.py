@@ -7,7 +7,7 @@ given the task with the truth by its method `see`; no other is given it.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -44,17 +44,6 @@ class EpisodeActor(Protocol):
         ...
 
 
-class EpisodeRecord(Protocol):
-    """What is kept of an episode."""
-
-    def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
-        """Add a step; `over` is true for the last one."""
-        ...
-
-
-R = TypeVar("R", bound=EpisodeRecord)
-
-
 def make_envs(
     env_id: str, count: int, *, dtype: str = "float32", threads: int = 1, **kwargs: Any
 ) -> gym.vector.VectorEnv:
@@ -78,9 +67,9 @@ def play(
     actor: Actor | EpisodeActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
-    begin: Callable[[int, int], R],
+    begin: Callable[[int, int], Any],
     progress: Callable[[int], object] = lambda ended: None,
-) -> list[R]:
+) -> list[Any]:
     """Play an episode of each seed and return its record; where one ends the next seed begins.
 
     Environments for which no seed is left are paused (`LaneVectorEnv.pause`).
@@ -90,11 +79,11 @@ def play(
             of an `EpisodeActor` may draw from the random numbers of each episode.
         envs: of `make_envs`.
         seeds: of the episodes.
-        begin: makes the record of an episode from the index of its environment and its seed.
+        begin: makes the record of an episode from the index of its environment and its seed; its `note` takes steps.
         progress: called after each step with the number of episodes that ended.
     """
     lanes = envs.unwrapped
-    waiting, records = list(range(len(seeds))), dict[int, R]()
+    waiting, records = list(range(len(seeds))), dict[int, Any]()
     playing: list[int | None] = [None] * envs.num_envs
     observations, begins = np.zeros(0), np.ones(envs.num_envs, dtype=np.bool_)
     while True:

@@ -47,7 +47,6 @@ from surgsim_env.scoring.results import (
     SITES,
     Result,
     load_result,
-    load_results,
     seeds_text,
     shipped_results,
 )
@@ -409,39 +408,15 @@ def _write(result: Result, player: Player, options: ScoringOptions) -> Path | No
     return None
 
 
-def print_comparison(one: str, other: str, options: ScoringOptions, console: Console) -> None:
-    """Print the differences of two results, each a file or a method's name."""
-    first, second = (_named_result(name, options) for name in (one, other))
+def print_comparison(one: Path, other: Path, console: Console) -> None:
+    """Print the differences of the results of two files."""
+    first, second = load_result(one), load_result(other)
     _say(
         console,
         f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap",
     )
     for difference in compare(first, second, np.random.default_rng(BOOTSTRAP_SEED)):
         _say(console, describe(difference, first.method, second.method))
-
-
-def _named_result(name: str, options: ScoringOptions) -> Result:
-    """The result of a file, or of a method at the place of the options."""
-    if name.endswith(".json"):
-        return load_result(Path(name))
-    folder, wanted = options.results or shipped_results(), _places(options, PLACES)
-    named = [one for one in load_results(folder) if name == one.method]
-    # An environment without a choice of scene or level has neither.
-    found = [
-        one
-        for one in named
-        if one.scene in ("", Path(wanted["scene"]).stem)
-        and one.env_kwargs.get("level") in (None, wanted["level"])
-        and one.env_kwargs.get("split") == wanted.get("split")
-        and one.motion == (options.motion or "")
-    ]
-    if len(found) != 1:
-        places = ", ".join(sorted(one.place for one in named)) or "none"
-        raise ValueError(
-            f"{name!r} names {len(found)} results in {_from_here(folder)} at {wanted['scene']}, {wanted['level']}; it "
-            f"has some at {places}: give --scene, --level and --motion, or a file"
-        )
-    return found[0]
 
 
 def _command(player: Player, options: ScoringOptions) -> str:

@@ -63,14 +63,10 @@ class ScoringOptions:
         return tuple(given)[: self.episodes]
 
     @property
-    def all_seeds(self) -> bool:
-        """Whether all evaluation seeds are played, and no others."""
-        return self.played_seeds == tuple(EVALUATION_SEEDS)
-
-    @property
     def standard(self) -> bool:
         """Whether results are those that are shipped: of all evaluation seeds, presses and lanes as by default."""
-        return self.all_seeds and self.budget is None and self.dtype == type(self).dtype
+        all_seeds = self.played_seeds == tuple(EVALUATION_SEEDS)
+        return all_seeds and self.budget is None and self.dtype == type(self).dtype
 
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:

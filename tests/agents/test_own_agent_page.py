@@ -17,7 +17,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "own_agent.md"
 def shorter(arguments: list[str]) -> list[str]:
     """Two organs and three presses, on a small scene, in place of a whole evaluation."""
     if "--compare" in arguments:
-        return [*arguments, *["--scene", "phantom_small"] * ("--results" in arguments)]
+        return ["--compare", *sorted(map(str, Path("scores").iterdir()))]
     if "--agent" not in arguments:
         return arguments
     if "--env" in arguments:

@@ -180,11 +180,10 @@ def learn(arguments: argparse.Namespace) -> None:
     """Search; print a line after each generation, and write the policy where it costs less than all before."""
     context, one_thread = get_context("spawn"), {"initializer": torch.set_num_threads, "initargs": (1,)}
     with ProcessPoolExecutor(arguments.processes, context, **one_thread) as pool:
-        search(arguments, partial(played, pool=pool, shares=arguments.processes))
+        _search(arguments, partial(played, pool=pool, shares=arguments.processes))
 
 
-def search(arguments: argparse.Namespace, play: Play) -> None:
-    """As `learn`, with a function that plays the episodes."""
+def _search(arguments: argparse.Namespace, play: Play) -> None:
     sources = weighted_sources(arguments.faces, arguments.weights)
     check_sources = weighted_sources(arguments.check_faces, arguments.weights)
     evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, sources, arguments.spread, play)

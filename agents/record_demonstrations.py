@@ -207,7 +207,7 @@ def record(
 
 
 def write_dataset(
-    episodes: Sequence[RecordedEpisode], env: gym.Env, name: str, *, algorithm_name: str, author: str = "surgsim"
+    episodes: Sequence[RecordedEpisode], env: gym.Env, name: str, *, algorithm_name: str
 ) -> minari.MinariDataset:
     """Write episodes as a Minari dataset with the spec of its environment.
 
@@ -218,7 +218,6 @@ def write_dataset(
         env: of the episodes; made with gym.make.
         name: of the dataset, such as "surgsim/retract/oracle-v0".
         algorithm_name: of the player.
-        author: of the dataset.
 
     Raises:
         ValueError: no episode, or a name that is taken.
@@ -237,7 +236,7 @@ def write_dataset(
             [episode.buffer(index, env.observation_space) for index, episode in enumerate(episodes)],
             env=spec,
             algorithm_name=algorithm_name,
-            author=author,
+            author="surgsim",
             code_permalink=CODE,
             description=f"{len(episodes)} episodes of {spec.id} by {algorithm_name}",
             requirements=["surgsim"],

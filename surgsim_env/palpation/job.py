@@ -309,8 +309,8 @@ def early_end(palpation: PalpationResult, index: int) -> str:
     return "" if palpation.used[index] else "force reading not above 0"
 
 
-def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Write and return the summary; undefined numbers, such as the error of a missed lesion, are null."""
+def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, Any]) -> None:
+    """Write the summary; undefined numbers, such as the error of a missed lesion, are null."""
     scene, mesh = palpation.anatomy.scene, palpation.anatomy.mesh
     forces = [press.force_peak for press in palpation.presses]
     summary = {
@@ -357,9 +357,7 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
         "wall_time_s": palpation.wall_time,
         "real_time_factor": palpation.simulated_time / palpation.wall_time,
     }
-    plain = plain_json(summary)
-    path.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return plain
+    path.write_text(json.dumps(plain_json(summary), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _held_entry(hold: Hold | None) -> dict[str, Any] | None:

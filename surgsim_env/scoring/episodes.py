@@ -142,21 +142,6 @@ class EpisodeFacts:
     hard_force: float
 
 
-class EpisodeAgent(Protocol):
-    """Plays one episode of an environment whose steps are control steps; each episode has an agent of its own.
-
-    For SurgSim/PalpateSites-v0, whose step is a press: `surgsim_env.training.site_agent.SiteAgent`.
-    """
-
-    def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
-        """Begin the episode."""
-        ...
-
-    def act(self, observation: Any) -> NDArray[np.float32]:
-        """The next action, shape (action_size,), for an observation as the environment gives it."""
-        ...
-
-
 def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeFacts:
     """The facts of an environment (its wrappers do not matter)."""
     single = env.unwrapped
@@ -209,7 +194,7 @@ class AgentActor:
         """Play agents that `make` gives.
 
         Args:
-            make: a `SiteAgent` or an `EpisodeAgent`.
+            make: an agent as docs/own_agent.md says.
             facts: gives an agent the constants of its environment, by default `SiteFacts`.
         """
         self.make, self.facts = make, facts

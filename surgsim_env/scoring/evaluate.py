@@ -75,7 +75,6 @@ class Player:
         sees_truth: whether it may see what is hidden.
         own_estimate: whether its own estimate is scored.
         ours: whether its result belongs in agents/results.
-        check: refuses an environment that it cannot play.
     """
 
     name: str
@@ -86,7 +85,6 @@ class Player:
     sees_truth: bool = False
     own_estimate: bool = False
     ours: bool = True
-    check: Callable[[gym.Env], None] = lambda env: None
 
 
 @dataclass(frozen=True)
@@ -97,13 +95,11 @@ class TaskAgent:
         env_id: the environment's.
         make: the script, for the environment's arguments.
         kwargs: further arguments of the environment.
-        has_places: whether the environment takes `scene` and `level`.
     """
 
     env_id: str
     make: Callable[[dict[str, Any]], Actor]
     kwargs: dict[str, Any] = field(default_factory=dict)
-    has_places: bool = False
 
 
 def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
@@ -123,18 +119,17 @@ TASK_AGENTS = {
         "SurgSim/Palpate-v0",
         lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
         {"memory": True},
-        has_places=True,
     ),
-    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE, has_places=True),
-    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE, has_places=True),
+    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE),
+    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE),
 }
 
 
-# Environments whose oracle plays its script, and whether they take `scene` and `level`.
+# Environments whose oracle plays its script.
 ORACLES = {
-    "oracle_palpate": ("SurgSim/Palpate-v0", True),
-    "oracle_retract": ("SurgSim/Retract-v0", False),
-    "oracle_bimanual_retract": ("SurgSim/BimanualRetract-v0", False),
+    "oracle_palpate": "SurgSim/Palpate-v0",
+    "oracle_retract": "SurgSim/Retract-v0",
+    "oracle_bimanual_retract": "SurgSim/BimanualRetract-v0",
 }
 
 
@@ -221,12 +216,11 @@ def find_player(name: str, options: ScoringOptions) -> Player:
     if ":" in name:
         return _strangers_player(name, options)
     if name in ORACLES:
-        env_id, has_places = ORACLES[name]
-        kwargs = _places(options, PLACES if has_places else {})
-        return Player(name, None, env_id, kwargs, chosen_by, sees_truth=True)
+        env_id = ORACLES[name]
+        return Player(name, None, env_id, _places(options, _defaults(env_id)), chosen_by, sees_truth=True)
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
-        kwargs = _places(options, PLACES if script.has_places else {}) | script.kwargs
+        kwargs = _places(options, _defaults(script.env_id)) | script.kwargs
         return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by)
     if name not in AGENTS:
         raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
@@ -249,6 +243,11 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     actor = strangers_actor(name, "--agent", env_id, given)
     declared = _declared(actor.make())
     return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, ours=False)
+
+
+def _defaults(env_id: str) -> dict[str, str]:
+    """Scene and level where options give none; of an environment without levels none."""
+    return PLACES if "Palpate" in env_id else {}
 
 
 def _declared(agent: Any) -> tuple[bool, bool]:
@@ -291,13 +290,9 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
     policy.reset(min(options.envs, len(options.played_seeds)))
 
-    def check(env: gym.Env) -> None:
-        policy.check_environment(env, f"policy {path}")
-
     return Player(
         *(path.stem, policy, env_id, kwargs, ("--policy", str(_from_here(path)))),
         ours=path.resolve().parent == policies_folder(),
-        check=check,
     )
 
 
@@ -335,7 +330,8 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     except (gym.error.Error, TypeError, ValueError) as error:
         raise ValueError(f"{name}: {env_id} with {kwargs} cannot be made: {error}") from error
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
-    player.check(first)
+    if player.chosen_by[0] == "--policy":
+        actor.check_environment(first, f"policy {name}")  # type: ignore[union-attr]
     start = time.perf_counter()
     with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
         if actor is not None and env_id == SITES:

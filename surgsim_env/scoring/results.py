@@ -56,18 +56,22 @@ class Result:
 
     @property
     def place(self) -> str:
-        """The key that groups tables (`place_name`)."""
-        return place_name(self.env_id, self.env_kwargs)
+        """The key that groups tables: environment, scene, level, a split other than "test" and motion."""
+        level, split = self.env_kwargs.get("level") or "", self.env_kwargs.get("split") or ""
+        name = self.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+        parts = [name, self.scene, level, "" if split == "test" else split, self.motion]
+        return "_".join(part for part in parts if part)
 
     @property
     def scene(self) -> str:
         """Name of the scene, also where it was given as a file; "" for the environment's own."""
-        return _scene_name(self.env_kwargs)
+        return Path(self.env_kwargs.get("scene") or "").stem
 
     @property
     def motion(self) -> str:
         """How the patient moves; "" for one who holds still."""
-        return _motion_name(self.env_kwargs)
+        motion = self.env_kwargs.get("motion") or STILL
+        return "" if motion == STILL else motion
 
     def save(self, folder: Path) -> Path:
         """Write it into a folder; replaces an older result of the same method and place."""
@@ -81,23 +85,6 @@ class Result:
         lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
         path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
         return path
-
-
-def place_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
-    """Environment, scene, level, a split other than "test" and motion, as a part of file names."""
-    parts = [env_id.removeprefix("SurgSim/").removesuffix("-v0"), _scene_name(env_kwargs)]
-    split = env_kwargs.get("split") or ""
-    parts += [env_kwargs.get("level") or "", "" if split == "test" else split, _motion_name(env_kwargs)]
-    return "_".join(part for part in parts if part)
-
-
-def _scene_name(env_kwargs: dict[str, Any]) -> str:
-    return Path(env_kwargs.get("scene") or "").stem
-
-
-def _motion_name(env_kwargs: dict[str, Any]) -> str:
-    motion = env_kwargs.get("motion") or STILL
-    return "" if motion == STILL else motion
 
 
 def shipped_results() -> Path:

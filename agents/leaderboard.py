@@ -108,10 +108,8 @@ def _sites(rows: list[Result]) -> str:
 def _tasks(rows: list[Result]) -> str:
     rows = ranked(rows)
     used = [column for column in TASKS if any(column[1] in _figures(row) for row in rows)]
-    counts = {row.method: len(row.seeds) for row in rows}
-    most = max(counts.values())
-    fewer = "".join(f", {count} of {method}" for method, count in counts.items() if count < most)
-    seeds = f"{most} episodes{fewer} (seeds from {rows[0].seeds[0]}), at most {rows[0].budget} control steps.\n"
+    first = rows[0]
+    seeds = f"{len(first.seeds)} episodes (seeds from {first.seeds[0]}), at most {first.budget} control steps.\n"
     return "\n".join([f"\n## {_title(rows[0])}\n", seeds, _table(rows, used)])
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.lane_group import LaneGroup, core_count
+from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.press import SitePress, in_threads, press_in_lanes, press_phases
 from surgsim_env.palpation.scene_options import with_substeps
@@ -409,7 +409,7 @@ def press_sites(
         return [_stiffness(anatomy, one) for one in presses]
 
     with progress.step(f"pressing the healthy organ {name}".strip(), len(sites)) as advance:
-        stiffness = in_threads(group, press, len(batches), min(core_count(), len(batches)))
+        stiffness = in_threads(group, press, len(batches))
     return np.array([value for batch in stiffness for value in batch])
 
 

@@ -100,7 +100,6 @@ def check_hold(
     normals: FloatArray,
     *,
     progress: Callable[[], None] = lambda: None,
-    workers: int | None = None,
 ) -> Hold | None:
     """Press up to SITES of some sites of the healthy organ, spread over them; see `hold_of`.
 
@@ -109,10 +108,9 @@ def check_hold(
         sites: to choose from [m], shape (n_site, 3).
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
-        workers: threads; all cores by default.
     """
     chosen = np.unique(np.linspace(0, len(sites) - 1, SITES).round().astype(int))
-    presses = scan(anatomy, anatomy.organ(), sites[chosen], normals[chosen], progress=progress, workers=workers)
+    presses = scan(anatomy, anatomy.organ(), sites[chosen], normals[chosen], progress=progress)
     return hold_of(anatomy, presses)
 
 

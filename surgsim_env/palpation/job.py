@@ -106,7 +106,6 @@ def run_palpation(
     lesions: Sequence[Lesion] | None = None,
     around: Ball | None = None,
     seed: int = 0,
-    workers: int | None = None,
     console: Console | None = None,
 ) -> PalpationResult:
     """Palpate a scene's organ; the same scene, lesions and seed give the same result.
@@ -116,7 +115,6 @@ def run_palpation(
         lesions: hidden in the organ; the scene's demonstration lesions by default.
         around: press only the raster sites inside this ball.
         seed: of sensor noise and of the errors of the pre-operative model.
-        workers: threads; all cores by default.
         console: where the progress bar is shown; nowhere by default.
 
     Raises:
@@ -132,11 +130,9 @@ def run_palpation(
     organ, model = anatomy.organ(hidden), anatomy.organ(modulus_factor=factor)
     model_sites, model_normals = _displaced(anatomy.face, sites, normals, rng)
     with press_progress(console) as bar:
-        presses = scan(
-            anatomy, organ, sites, normals, workers=workers, progress=progress_task(bar, "organ", len(sites))
-        )
+        presses = scan(anatomy, organ, sites, normals, progress=progress_task(bar, "organ", len(sites)))
         step = progress_task(bar, "its pre-operative model", len(sites))
-        model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
+        model_presses = scan(anatomy, model, model_sites, model_normals, progress=step)
         reading = _read(presses, scene.sensor, rng)
         model_reading = _read(model_presses, scene.sensor, rng)
         complete = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])

@@ -74,7 +74,7 @@ def explain_misses(
         hidden = _hidden(anatomy, lesions[index], truth)
         bare = anatomy.organ([lesion for number, lesion in enumerate(lesions) if number != index])
         force, force_without = (
-            scan(anatomy, model, truth.point[None], truth.normal[None], workers=1, progress=advance)[0].force
+            scan(anatomy, model, truth.point[None], truth.normal[None], progress=advance)[0].force
             for model in (organ, bare)
         )
         for one in maps:

@@ -298,9 +298,8 @@ def scan(
     normals: FloatArray,
     *,
     progress: Callable[[], None] = lambda: None,
-    workers: int | None = None,
 ) -> list[Press]:
-    """Press each site of a resting organ; presses are independent, so the result does not depend on the workers.
+    """Press each site of a resting organ, on all cores; presses are independent: the result does not depend on them.
 
     Args:
         anatomy: the scene's organ.
@@ -308,9 +307,7 @@ def scan(
         sites: surface points [m], shape (n_site, 3).
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
-        workers: threads (the kernels hold no interpreter lock); all cores by default.
     """
-    threads = min(workers or core_count(), max(1, len(sites)))
 
     def simulation() -> Simulation:
         made = Simulation(anatomy)
@@ -322,11 +319,11 @@ def scan(
         progress()
         return done
 
-    return in_threads(simulation, pressed, len(sites), threads)
+    return in_threads(simulation, pressed, len(sites))
 
 
-def in_threads(make: Callable[[], Tool], work: Callable[[Tool, int], Result], count: int, threads: int) -> list[Result]:
-    """Results of `work` for all numbers below `count`; each thread makes a tool of its own for it.
+def in_threads(make: Callable[[], Tool], work: Callable[[Tool, int], Result], count: int) -> list[Result]:
+    """Results of `work` for all numbers below `count`, on all cores; each thread makes a tool of its own for it.
 
     An error, or Ctrl-C, cancels the calls that have not begun.
     """
@@ -337,5 +334,6 @@ def in_threads(make: Callable[[], Tool], work: Callable[[Tool, int], Result], co
             own.tool = make()
         return work(own.tool, number)
 
-    with ThreadPoolExecutor(threads) as pool:
+    # The kernels hold no interpreter lock.
+    with ThreadPoolExecutor(core_count()) as pool:
         return list(pool.map(run, range(count)))

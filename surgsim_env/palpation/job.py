@@ -29,7 +29,7 @@ from surgsim_env.palpation.contrast_map import (
     score_map,
 )
 from surgsim_env.palpation.hold import Hold, hold_of
-from surgsim_env.palpation.misses import HEALTHY_FEWEST, Miss, explain_misses
+from surgsim_env.palpation.misses import Miss, explain_misses
 from surgsim_env.palpation.press import Press, scan
 from surgsim_env.palpation.truth import Truth, seen_from_surface
 from surgsim_env.scene.anatomy import SUPPORT_TIP_RADII, Anatomy
@@ -414,12 +414,6 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         for miss in palpation.misses:
             if miss.map_name == one.name:
                 console.print(f"  {miss.lesion}: {miss.text}", highlight=False, markup=False)
-    fewest = min(one.healthy_count for one in palpation.maps)
-    if fewest < HEALTHY_FEWEST:
-        console.print(
-            f"weak baseline: {fewest} healthy sites, the rule is at least {HEALTHY_FEWEST}: press more sites (smaller "
-            "--spacing, no --around)"
-        )
     if palpation.hold is not None:
         console.print(f"held: {palpation.hold.text}", highlight=False)
         for fault in palpation.hold.faults:

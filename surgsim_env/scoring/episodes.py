@@ -172,14 +172,10 @@ def check_agent(agent: object, name: str) -> None:
         method: callable(getattr(type(agent), method, None))
         for method in ("reset", "act", "see", "estimate", "estimate_map")
     }
-    for method, why in (
-        ("reset", "begins an episode"),
-        ("act", "chooses an action"),
-        *((("see", "takes the task with the truth, as its class declares sees_truth = True"),) * sees_truth(agent)),
-        *((("estimate_map", "gives the map beside the places of its method estimate"),) * has["estimate"]),
-    ):
+    needed = ("reset", "act", *["see"] * sees_truth(agent), *["estimate_map"] * has["estimate"])
+    for method in needed:
         if not has[method]:
-            raise ValueError(f"{name} has no method {method}, which {why}: docs/own_agent.md says what an agent has")
+            raise ValueError(f"{name} has no method {method}: docs/own_agent.md says what an agent has")
     if has["see"] and not sees_truth(agent):
         raise ValueError(
             f"{name} has a method see, which takes the task with the truth, and its class does not declare "

@@ -53,7 +53,7 @@ class ScoringOptions:
         given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)
         if self.episodes is not None and not 1 <= self.episodes <= len(given):
             raise ValueError(f"--episodes is {self.episodes}; there are 1 to {len(given)} seeds")
-        if not isinstance(self.env_arguments, str) or not isinstance(_json(self.env_arguments), dict):
+        if not isinstance(self.env_kwargs, dict):
             raise ValueError(f"--env-arguments is {self.env_arguments!r}; it must be a JSON object")
 
     @cached_property
@@ -71,11 +71,4 @@ class ScoringOptions:
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:
         """`env_arguments` as a dictionary."""
-        return _json(self.env_arguments)
-
-
-def _json(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return None
+        return json.loads(self.env_arguments)

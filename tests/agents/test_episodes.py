@@ -137,7 +137,7 @@ def begun(make: Callable[[], Any], env: gym.Env) -> Any:
     ],
 )
 def test_an_agent_without_a_method_is_refused_before_its_episode(entries: dict[str, Any], missing: str):
-    with pytest.raises(ValueError, match=f"Partial has no method {missing},"):
+    with pytest.raises(ValueError, match=f"Partial has no method {missing}:"):
         check_agent(type("Partial", (), entries)(), "Partial")
 
 

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from surgsim_env.envs.ids import TASKS
-from surgsim_env.scene.load import fill_json
+from surgsim_env.scene.load import fill
 from surgsim_env.tasks.task import Task
 from surgsim_env.training.acquisition import Acquisition
 from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
@@ -201,14 +201,14 @@ def read_description(path: Path) -> PolicyDescription:
     """The description in NAME.json, the path of a policy's either file.
 
     Raises:
-        ValueError: no such file, a file that is no JSON table, or an entry that is unknown, missing or wrong.
+        ValueError: no such file, a file that is no JSON, or an entry that is unknown, missing or wrong.
     """
     document = path.with_suffix(".json")
     try:
-        text = document.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        table = json.loads(document.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise ValueError(f"policy {document} cannot be read: {error}") from None
-    return fill_json(PolicyDescription, text, f"policy {document}")
+    return fill(PolicyDescription, table, f"policy {document}")
 
 
 def _filled(layout: NetworkLayout, weights: dict[str, torch.Tensor]) -> PolicyNetwork:

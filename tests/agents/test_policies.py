@@ -125,8 +125,8 @@ def test_files_that_are_missing_or_damaged_are_refused(path: Path):
     weights.unlink()
     with pytest.raises(ValueError, match=r"policy .*p\.safetensors: .*No such file"):
         load_policy(path)
-    path.write_text("[1]")
-    with pytest.raises(ValueError, match=r"policy .*p\.json: '\[1\]' is no JSON object"):
+    path.write_text("[1")
+    with pytest.raises(ValueError, match=r"policy .*p\.json cannot be read"):
         load_policy(path)
     path.unlink()
     with pytest.raises(ValueError, match=r"policy .*p\.json cannot be read"):

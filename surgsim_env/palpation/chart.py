@@ -441,7 +441,7 @@ def map_digest(anatomy: Anatomy) -> str:
 def cache_folder() -> Path:
     """The cache's folder."""
     named = os.environ.get(FOLDER_VARIABLE)
-    return Path(named or Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "surgsim")
+    return Path(named or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim")
 
 
 def keep_map(path: Path, grid: FloatArray) -> None:

@@ -8,16 +8,12 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+import minari
 import numpy as np
 
-from agents.command_line import one_line_errors
-
-with one_line_errors(__name__, "agents", "demonstrations"):
-    import minari
-
-    from surgsim_env.training.fit import fit
-    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
-    from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_env.training.fit import fit
+from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -46,5 +42,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents", "demonstrations"):
-        main()
+    main()

@@ -1,160 +1,189 @@
-"""Write agents/LEADERBOARD.md and a picture for each scene, docs/images/leaderboard_*.png, from agents/results/*.json.
+"""Write agents/LEADERBOARD.md from the result files agents/results/*.json.
 
 python -m agents.leaderboard
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import matplotlib
-
-from agents.leaderboard_tables import ranked, shown_name, write_leaderboard
 from surgsim_env.palpation.scores import ScoreEstimate
-from surgsim_env.scoring.results import SITES, Result, load_results, picture_name, shipped_results
-
-matplotlib.use("Agg")
-from matplotlib.figure import Figure
+from surgsim_env.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
 
 LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
-IMAGES = LEADERBOARD.parents[1] / "docs" / "images"
-WIDTH, DPI = 8.4, 110  # [in], [1/in]
-# Heights of a method, of a panel's title, and of what surrounds all panels [in].
-ROW, HEADING, MARGINS = 0.23, 0.35, 1.1
-# Where a number of presses that is never reached stands, over the budget.
-NEVER = 1.13
 
-
-class Quantity(NamedTuple):
-    """A column of panels: a figure's name, what its axis says, and a factor."""
-
-    name: str
-    label: str
-    factor: float = 1.0
-
-
-# What a picture shows of press-by-press palpation, and of the other environments.
-SITE_COLUMNS = (
-    Quantity("presses_to_median", "median presses to the 5 mm line"),
-    Quantity("success", "success after all presses [%]", 100.0),
+# Columns: heading, figure, decimals, factor.
+Column = tuple[str, str, int, float]
+PLACES: tuple[Column, ...] = (
+    ("presses to 5 mm, median", "presses_to_median", 0, 1.0),
+    ("90th percentile", "presses_to_p90", 0, 1.0),
+    ("success [%]", "success", 0, 100.0),
+    ("error [mm]", "error_mm", 1, 1.0),
+    ("over all presses [mm]", "error_of_presses_mm", 1, 1.0),
+    ("centroid [mm]", "centroid_error_mm", 1, 1.0),
+    ("recall [%]", "recall", 0, 100.0),
+    ("precision [%]", "precision", 0, 100.0),
+    ("number right [%]", "count_right", 0, 100.0),
 )
-TASK_COLUMNS = (Quantity("success", "success [%]", 100.0), Quantity("seconds", "time to success [s]"))
-# Kinds of methods with their colours (Okabe & Ito 2008); a marker without filling sees the truth.
-KINDS = {
-    "learned": "#D55E00",
-    "searches by belief": "#0072B2",
-    "scripted": "#555555",
-    "sees the truth": "#000000",
-}
+MAPS: tuple[Column, ...] = (
+    ("outline IoU", "outline_iou", 2, 1.0),
+    ("difference [mm^2]", "outline_difference_mm2", 0, 1.0),
+    ("AUROC", "auroc", 3, 1.0),
+    ("AP", "average_precision", 2, 1.0),
+    ("force mean [N]", "force_mean", 2, 1.0),
+    ("p95 [N]", "force_p95", 2, 1.0),
+    ("peak [N]", "force_peak", 2, 1.0),
+    ("presses over soft limit [%]", "soft_force_share", 1, 100.0),
+    ("impulse [N s]", "impulse", 2, 1.0),
+    ("time [s]", "seconds", 0, 1.0),
+    ("path [m]", "path_length", 2, 1.0),
+    ("hard limit, faults [%]", "violations", 0, 100.0),
+)
+TASKS: tuple[Column, ...] = (
+    ("success [%]", "success", 0, 100.0),
+    ("time to success [s]", "seconds", 1, 1.0),
+    ("error [mm]", "error_mm", 1, 1.0),
+    ("peak force [N]", "force_peak", 2, 1.0),
+    ("under soft limit [%]", "under_soft_force", 0, 100.0),
+    ("torn [%]", "torn", 0, 100.0),
+    ("peak grip [N]", "grip_force_peak", 2, 1.0),
+    ("peak pull [N]", "pull_force_peak", 2, 1.0),
+    ("slips", "slips", 1, 1.0),
+    ("hard limit, faults [%]", "violations", 0, 100.0),
+    ("return", "return", 2, 1.0),
+)
 
 
-def draw_leaderboard(results: Sequence[Result], folder: Path) -> list[Path]:
-    """Draw the picture of each environment and scene; returns the files.
-
-    A row of panels for each level and motion, a line for each method in the order of the leaderboard: the value, and
-    the interval of the leaderboard as a bar. Methods that are scored by an estimate of their own are left out.
-    """
-    pictures: dict[str, dict[str, list[Result]]] = {}
-    for result in results:
-        if not result.own_estimate:
-            pictures.setdefault(picture_name(result), {}).setdefault(result.place, []).append(result)
-    made = []
-    for name, places in pictures.items():
-        rows = {place: ranked(members) for place, members in sorted(places.items(), key=lambda one: _level(one[1][0]))}
-        made.append(folder / name)
-        _draw(rows, made[-1])
-    return made
+def write_leaderboard(folder: Path, path: Path) -> None:
+    """Write the tables of all results of a folder."""
+    results = load_results(folder)
+    places = sorted({result.place for result in results}, key=_order)
+    parts = [HEADER]
+    for place in places:
+        rows = [result for result in results if result.place == place]
+        parts.append(_sites(rows) if rows[0].env_id == SITES else _tasks(rows))
+    parts.append(_commands(results))
+    path.write_text("\n".join(parts), encoding="utf-8")
 
 
-def kind(result: Result) -> str:
-    """Which of KINDS a method is."""
-    if result.sees_truth:
-        return "sees the truth"
-    if "--policy" in result.command:
-        return "learned"
-    return "searches by belief" if result.method.startswith("gp_") else "scripted"
+HEADER = """# Leaderboard
+
+Written by `python -m agents.leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
+Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
+line that was not reached within the presses of an episode. Baselines and policies play the same organs. The rasters
+shown are the best of those tried, by presses to 5 mm, then by the error over all presses. Methods marked
+**sees truth** know what is hidden: `truth` reports it, the oracles press with that knowledge. Where the patient moves,
+presses and oracles track the surface by markers; methods whose name ends in `untracked` press at the rest position.
+How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
+`surgsim evaluate --compare A.json B.json`, for results of one version of the physics.
+"""
 
 
-def _level(result: Result) -> tuple[bool, int]:
-    levels = ("easy", "standard", "hard", "clinical")
-    level = result.env_kwargs.get("level")
-    return bool(result.motion), levels.index(level) if level in levels else len(levels)
+def _order(place: str) -> tuple[int, str]:
+    levels = ("standard", "easy", "hard", "clinical")
+    found = [index for index, level in enumerate(levels) if place.endswith(level)]
+    return (0 if place.startswith("PalpateSites") else 1, f"{place.rsplit('_', 1)[0]}{found[0] if found else 9}")
 
 
-def _draw(places: dict[str, list[Result]], path: Path) -> None:
-    heights = [len(rows) for rows in places.values()]
-    figure = Figure((WIDTH, ROW * sum(heights) + HEADING * len(places) + MARGINS), dpi=DPI, layout="constrained")
-    shown = [row for rows in places.values() for row in rows]
-    columns = SITE_COLUMNS if shown[0].env_id == SITES else TASK_COLUMNS
-    panels: Any = figure.subplots(len(places), 2, squeeze=False, sharex="col", sharey="row", height_ratios=heights)
-    for line, rows in zip(panels, places.values(), strict=True):
-        for axes, column in zip(line, columns, strict=True):
-            _draw_panel(axes, rows, column, never=NEVER * max(row.budget for row in shown))
-        line[0].set_yticks(range(len(rows)), [shown_name(row) for row in rows], fontsize=8)
-        line[0].set_ylim(len(rows) - 0.5, -0.5)
-        told = [rows[0].env_kwargs.get("level"), rows[0].motion and f"motion {rows[0].motion}"]
-        line[0].set_title(", ".join(part for part in told if part), loc="left", fontsize=9)
-    for axes, column in zip(panels[-1], columns, strict=True):
-        axes.set_xlabel(column.label, fontsize=8)
-        _set_scale(axes, column, max(row.budget for row in shown))
-    used = [name for name in KINDS if any(kind(row) == name for row in shown)]
-    handles = [panels[0, 0].plot([], [], "o", label=name, **_marker(name))[0] for name in used]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(used), frameon=False, fontsize=8)
-    figure.suptitle(f"{shown[0].env_id} {shown[0].scene}".strip(), fontsize=10, fontweight="bold")
-    figure.savefig(path)
+def ranked(rows: Sequence[Result]) -> list[Result]:
+    """The rows of one place as the leaderboard shows them, best first, with the best raster alone."""
+    if rows[0].env_id == SITES:
+        return sorted(best_raster_alone(rows), key=_merit)
+    return sorted(rows, key=lambda result: -(result.figures["success"].value or 0.0))
 
 
-def _draw_panel(axes: Any, rows: Sequence[Result], column: Quantity, never: float) -> None:
-    """Values with their intervals, one line each; what is never reached stands at `never`."""
-    for line, row in enumerate(rows):
-        value, low, high = _scaled(row.figures.get(column.name), column.factor, never)
-        if value is None:
-            axes.text(0.02, line, "none succeeded", transform=axes.get_yaxis_transform(), va="center", fontsize=7)
-            continue
-        marker = _marker(kind(row))
-        axes.plot([low, high], [line, line], color=marker["color"], linewidth=2.0, alpha=0.45, solid_capstyle="butt")
-        axes.plot([value], [line], "o", **marker)
-    axes.tick_params(labelsize=8)
-    axes.grid(alpha=0.3)
-    axes.set_axisbelow(True)
-
-
-def _set_scale(axes: Any, column: Quantity, budget: int) -> None:
-    """Limits and ticks of a column of panels."""
-    if column.factor == 100.0:
-        axes.set_xlim(-3.0, 103.0)
-    elif column.name == "presses_to_median":
-        ticks = range(0, budget + 1, 5 if budget <= 30 else 10)
-        axes.set_xticks([*ticks, NEVER * budget], [*map(str, ticks), "never"])
-        axes.set_xlim(0.0, 1.03 * NEVER * budget)
-    else:
-        axes.set_xlim(0.0, 1.06 * axes.get_xlim()[1])
-
-
-def _marker(name: str) -> dict[str, Any]:
-    hollow = {"markerfacecolor": "white"} if name == "sees the truth" else {}
-    return {"color": KINDS[name], "markersize": 6.0, "markeredgewidth": 1.4, **hollow}
-
-
-def _scaled(
-    figure: ScoreEstimate | None, factor: float, never: float
-) -> tuple[float | None, float | None, float | None]:
-    """Value and interval for the axis; what is never reached at `never`."""
-    if figure is None or figure.value is None:
-        return None, None, None
-    value, low, high = (
-        never if one is not None and math.isinf(one) else factor * (figure.value if one is None else one)  # type: ignore[operator]
-        for one in (figure.value, figure.low, figure.high)
+def _sites(rows: list[Result]) -> str:
+    rows = ranked(rows)
+    first = max(rows, key=lambda row: row.budget)
+    lesions = first.lesion_counts
+    organs = (
+        f"{len(lesions)} organs (seeds {seeds_text(first.seeds)}), {sum(lesions)} lesions, "
+        f"{lesions.count(0)} organs without one; {first.budget} presses.\n"
     )
-    return value, low, high
+    parts = [f"\n## {_title(first)}\n", organs, _table(rows, PLACES), "", _table(rows, MAPS)]
+    return "\n".join(parts)
 
 
-def main() -> None:
-    """Write tables and pictures."""
-    write_leaderboard(shipped_results(), LEADERBOARD)
-    draw_leaderboard(load_results(shipped_results()), IMAGES)
+def _tasks(rows: list[Result]) -> str:
+    rows = ranked(rows)
+    used = [column for column in TASKS if any(column[1] in _figures(row) for row in rows)]
+    first = rows[0]
+    seeds = f"{len(first.seeds)} episodes (seeds from {first.seeds[0]}), at most {first.budget} control steps.\n"
+    return "\n".join([f"\n## {_title(rows[0])}\n", seeds, _table(rows, used)])
+
+
+def _title(result: Result) -> str:
+    scene, level = result.scene, result.env_kwargs.get("level")
+    moves = f"motion {result.motion}" * bool(result.motion)
+    told = ", ".join(part for part in (level, moves) if part)
+    return " ".join(part for part in (f"`{result.env_id}`", scene, f"({told})" if told else "") if part)
+
+
+def best_raster_alone(rows: Sequence[Result]) -> list[Result]:
+    """The rows with the best raster only."""
+    rasters = [row for row in rows if row.method.startswith("raster_")]
+    if not rasters:
+        return list(rows)
+    best = min(rasters, key=_merit)
+    return [row for row in rows if row not in rasters or row is best]
+
+
+def _merit(result: Result) -> tuple[float, float]:
+    presses, error = result.figures["presses_to_median"].value, result.figures["error_of_presses_mm"].value
+    return (math.inf if presses is None else presses, math.inf if error is None else error)
+
+
+def _figures(result: Result) -> dict[str, ScoreEstimate]:
+    """The figures, with hard limits and faults summed."""
+    both = [astuple(result.figures[name]) for name in ("hard_limit_share", "fault_share")]
+    return {
+        **result.figures,
+        "violations": ScoreEstimate(*((a or 0.0) + (b or 0.0) for a, b in zip(*both, strict=True))),
+    }
+
+
+def _table(rows: Sequence[Result], columns: Sequence[Column]) -> str:
+    head = ["method", *(column[0] for column in columns)]
+    lines = [_line(head), _line(["---"] * len(head))]
+    lines += [_line([_name(row), *(_cell(_figures(row), column) for column in columns)]) for row in rows]
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def shown_name(result: Result) -> str:
+    """A method's name as tables and pictures show it."""
+    side = result.method.removeprefix("raster_")
+    return f"raster {side} x {side}" if side != result.method else result.method
+
+
+def _name(result: Result) -> str:
+    return shown_name(result) + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
+
+
+def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:
+    _, name, decimals, factor = column
+    figure = figures.get(name)
+    if figure is None or figure.value is None:
+        return ""
+    value, low, high = (_number(one, decimals, factor) for one in (figure.value, figure.low, figure.high))
+    return value if value == low == high else f"{value} ({low} to {high})"
+
+
+def _number(value: float | None, decimals: int, factor: float) -> str:
+    if value is None:
+        return ""
+    return "never" if math.isinf(value) else f"{value * factor:.{decimals}f}"
+
+
+def _commands(results: Sequence[Result]) -> str:
+    lines = ["\n## Commands\n", _line(["command", "wall time [s]", "date"]), _line(["---"] * 3)]
+    lines += [_line([f"`{row.command}`", f"{row.wall_time:.0f}", row.date]) for row in results]
+    return "\n".join([*lines, "", "Wall times were measured on a 2-core machine under other load.", ""])
 
 
 if __name__ == "__main__":
-    main()
+    write_leaderboard(shipped_results(), LEADERBOARD)

@@ -12,28 +12,24 @@ import argparse
 import time
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from agents.command_line import one_line_errors
-
-with one_line_errors(__name__, "agents"):
-    import gymnasium as gym
-    import torch
-
-    from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
-    from surgsim_env.training.face_features import (
-        LATE,
-        SUMMARY_SIZE,
-        WAY_MOST,
-        FaceFeatures,
-        face_features,
-        face_summary,
-    )
-    from surgsim_env.training.face_surrogate import FaceSurrogate
-    from surgsim_env.training.fit import fit
-    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
-    from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
+from surgsim_env.training.face_features import (
+    LATE,
+    SUMMARY_SIZE,
+    WAY_MOST,
+    FaceFeatures,
+    face_features,
+    face_summary,
+)
+from surgsim_env.training.face_surrogate import FaceSurrogate
+from surgsim_env.training.fit import fit
+from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
 
 ENV_ID = "SurgSim/Palpate-v0"
 BATCH = 512
@@ -178,5 +174,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents"):
-        main()
+    main()

@@ -18,19 +18,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import one_line_errors
 from surgsim_env.rendering.looks import draw_look, find_look_ranges
 from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
-
-with one_line_errors(__name__, "agents"):
-    import torch
-
-    from surgsim_env.training.fit import fit
-    from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
-    from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_env.training.fit import fit
+from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
 
 ID = "SurgSim/Retract-v0"
 PICTURES: dict[str, Any] = {"obs_mode": "rgb_force", "looks": "train"}
@@ -211,5 +207,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents"):
-        main()
+    main()

@@ -5,7 +5,7 @@
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `surgsim_env.training.acquisition.Acquisition`, beginning at the upper confidence
-bound of `gp_ucb` or at a policy. All candidates of a generation play the same episodes on faces that
+bound of `gp_ucb`. All candidates of a generation play the same episodes on faces that
 `agents.record_faces` has recorded, as many of each recording, with `--weights` in the cost; each generation has new
 ones. Processes share the episodes. An episode costs
 
@@ -29,30 +29,25 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
+import cma
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.special import expit
 
-from agents.command_line import one_line_errors
-
-with one_line_errors(__name__, "agents"):
-    import cma
-    import torch
-    from scipy.special import expit
-
-    from surgsim_env.palpation.chart import MAP_SIDE
-    from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
-    from surgsim_env.training.acquisition import Acquisition
-    from surgsim_env.training.policy_files import (
-        PolicyDescription,
-        load_policy,
-        observation_declaration,
-        policy_path,
-        save_policy,
-    )
-    from surgsim_env.training.recorded_faces import load_faces
-    from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
-    from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
+from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
+from surgsim_env.training.acquisition import Acquisition
+from surgsim_env.training.policy_files import (
+    PolicyDescription,
+    observation_declaration,
+    policy_path,
+    save_policy,
+)
+from surgsim_env.training.recorded_faces import load_faces
+from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
+from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
 # From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.
@@ -128,7 +123,6 @@ class Evolution:
         population: candidates of a generation.
         episodes: of each candidate, on faces of each source.
         seed: of the candidates and the episodes.
-        start: the acquisition function to begin at.
         sources: what draws faces, and its weight in the cost; the weights' sum is 1.
         spread: standard deviation of the first generation in PARAMETER_STEPS.
         play: plays the episodes.
@@ -137,7 +131,6 @@ class Evolution:
     population: int
     episodes: int
     seed: int
-    start: Acquisition
     sources: Sequence[tuple[Draw, float]]
     spread: float = FIRST_SPREAD
     play: Play = play
@@ -156,7 +149,7 @@ class Evolution:
 
     def acquisition(self, steps: NDArray[np.float64]) -> Acquisition:
         """The acquisition function so many steps from the first one (13,)."""
-        return Acquisition(tuple((np.array(self.start.values) + steps * PARAMETER_STEPS).tolist()))
+        return Acquisition(tuple((np.array(Acquisition().values) + steps * PARAMETER_STEPS).tolist()))
 
     @property
     def best(self) -> Acquisition:
@@ -177,27 +170,9 @@ class Evolution:
         self.episode_count += self.population * self.episodes * len(self.sources)
 
 
-def policy_acquisition(path: Path) -> Acquisition:
-    """The acquisition function of a policy's file.
-
-    Raises:
-        ValueError: a policy that has none.
-    """
-    decider = load_policy(path).decider
-    if not isinstance(decider, Acquisition):
-        raise ValueError(f"--start {path} has no acquisition function: take a policy of agents.learn_sites")
-    return decider
-
-
 def weighted_sources(paths: Sequence[Path], weights: Sequence[float] | None = None) -> list[tuple[Draw, float]]:
-    """Recordings with their shares of the weights, by default equal ones.
-
-    Raises:
-        ValueError: not a weight for each recording, or negative ones.
-    """
-    weights = [1.0] * len(paths) if weights is None else weights
-    if len(weights) != len(paths) or min(weights) < 0.0 or math.fsum(weights) == 0.0:
-        raise ValueError(f"--weights are {list(weights)} for {len(paths)} recordings; each has one, none is negative")
+    """Recordings with their shares of the weights, by default equal ones."""
+    weights = weights or [1.0] * len(paths)
     return [(load_faces(path), weight / math.fsum(weights)) for path, weight in zip(paths, weights, strict=True)]
 
 
@@ -205,17 +180,13 @@ def learn(arguments: argparse.Namespace) -> None:
     """Search; print a line after each generation, and write the policy where it costs less than all before."""
     context, one_thread = get_context("spawn"), {"initializer": torch.set_num_threads, "initargs": (1,)}
     with ProcessPoolExecutor(arguments.processes, context, **one_thread) as pool:
-        search(arguments, partial(played, pool=pool, shares=arguments.processes))
+        _search(arguments, partial(played, pool=pool, shares=arguments.processes))
 
 
-def search(arguments: argparse.Namespace, play: Play) -> None:
-    """As `learn`, with a function that plays the episodes."""
-    start = Acquisition() if arguments.start is None else policy_acquisition(arguments.start)
+def _search(arguments: argparse.Namespace, play: Play) -> None:
     sources = weighted_sources(arguments.faces, arguments.weights)
     check_sources = weighted_sources(arguments.check_faces, arguments.weights)
-    evolution = Evolution(
-        arguments.population, arguments.episodes, arguments.seed, start, sources, arguments.spread, play
-    )
+    evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, sources, arguments.spread, play)
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
     made = gym.make(ID, scene="phantom_small").unwrapped
     least = evolution.cost(evolution.best, check, check_sources)
@@ -244,7 +215,6 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.json")
-    parser.add_argument("--start", type=Path, help="a policy to begin at, in place of the upper confidence bound")
     parser.add_argument("--faces", type=Path, nargs="+", required=True, help="recordings of agents.record_faces")
     parser.add_argument("--weights", type=float, nargs="*", help="of the recordings in the cost; equal by default")
     parser.add_argument(
@@ -261,5 +231,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents"):
-        main()
+    main()

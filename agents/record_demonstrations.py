@@ -1,8 +1,7 @@
-"""Record episodes of an oracle, an agent, a trained policy or a person as a Minari or LeRobot data set.
+"""Record episodes of an oracle, an agent or a trained policy as a Minari or LeRobot data set.
 
     python -m agents.record_demonstrations SurgSim/Retract-v0 --episodes 100 --dataset surgsim/retract/oracle-v0
-    python -m agents.record_demonstrations SurgSim/Palpate-v0 --by agents.raster:RasterAgent \
-        --dataset surgsim/palpate/raster-v0
+    python -m agents.record_demonstrations SurgSim/Palpate-v0 --by my_agent:Descend --dataset surgsim/palpate/mine-v0
     python -m agents.record_demonstrations SurgSim/Palpate-v0 --format lerobot --dataset runs/palpate --episodes 100 \
         --images endoscope --keep-failures
 
@@ -10,7 +9,7 @@ With `--format lerobot` the data set is the folder `--dataset` (`agents/lerobot_
 
 Minari's datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored
 with its seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations
-to the bit. A person plays with `--by keyboard` (`agents/keyboard.py`). `Recorder` records any other code that steps an
+to the bit. `Recorder` records any other code that steps an
 environment:
 
     env = Recorder(gym.make("SurgSim/Palpate-v0"))
@@ -22,35 +21,28 @@ import argparse
 import copy
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import minari
 import numpy as np
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import one_line_errors
-from agents.keyboard import Keyboard
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.scene.digest import PHYSICS_VERSION
-from surgsim_env.scoring.episodes import AgentActor, EpisodeActor, agent_generator, episode_facts
-from surgsim_env.scoring.evaluate import strangers_agent
-from surgsim_env.scoring.results import SITES
+from surgsim_env.scoring.episodes import EpisodeActor, agent_generator
+from surgsim_env.scoring.evaluate import strangers_actor
 from surgsim_env.scripting import ScriptError, oracle_script, run_script
 from surgsim_env.scripting.observations import stacked_observations
-from surgsim_env.training.site_agent import site_facts
-
-with one_line_errors(__name__, "agents", "demonstrations"):
-    import minari
-    from minari.data_collector.episode_buffer import EpisodeBuffer
-    from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.storage.datasets_root_dir import get_dataset_path
-    from tqdm import tqdm
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".json", ".safetensors")
@@ -152,7 +144,7 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     """The player of a name.
 
     Args:
-        by: "oracle", "keyboard", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
+        by: "oracle", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
         env: where it plays, made with gym.make.
         env_arguments: of the environment, as an agent is told them; without those of the recording's pictures.
 
@@ -161,9 +153,6 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     """
     if by == "oracle":
         return play_oracle
-    if by == "keyboard":
-        keyboard = Keyboard(env)
-        return lambda env, seed: play_actor(env, seed, keyboard)
     if by.endswith(POLICY_SUFFIXES):
         from surgsim_env.training.policy_files import load_policy
 
@@ -172,11 +161,9 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
         policy.reset(1)
         return lambda env, seed: play_actor(env, seed, policy)
     if ":" not in by:
-        raise ValueError(f"--by is {by!r}; the rule is oracle, keyboard, a policy's NAME.json or MODULE:CLASS")
-    make, _ = strangers_agent(by, "--by")
+        raise ValueError(f"--by is {by!r}; the rule is oracle, a policy's NAME.json or MODULE:CLASS")
     assert env.spec is not None
-    env_id = env.spec.id
-    actor = AgentActor(make, site_facts if env_id == SITES else lambda one: episode_facts(one, env_id, env_arguments))
+    actor = strangers_actor(by, "--by", env.spec.id, env_arguments)
     return lambda env, seed: play_actor(env, seed, actor)
 
 
@@ -197,12 +184,14 @@ def record(
 ) -> Iterator[RecordedEpisode]:
     """Play an episode for each seed; yields those that succeeded, or all.
 
-    Ctrl-C, and a person who closes the window, end it with the episodes that were played to their end.
+    Ctrl-C ends it with the episodes that were played to their end.
 
     Raises:
         ValueError: seeds that are reserved for scores.
     """
-    check_seeds(seeds)
+    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
+    if kept is not None:
+        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
     recorder, success_count = Recorder(env, read), 0
     with tqdm(seeds, unit="episode") as progress:
         for index, seed in enumerate(progress):
@@ -217,39 +206,8 @@ def record(
             yield from (episode for episode in recorder.episodes if keep_failures or episode.success)
 
 
-def check_seeds(seeds: Iterable[int]) -> None:
-    """Refuse seeds that are reserved for scores.
-
-    Raises:
-        ValueError: names the first.
-    """
-    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
-    if kept is not None:
-        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
-
-
-def check_dataset_name(name: str) -> None:
-    """Check that a Minari data set of this name can be written.
-
-    Raises:
-        ValueError: a name that Minari does not take, or one that is taken.
-    """
-    try:
-        parse_dataset_id(name)
-    # Without a version Minari raises a TypeError.
-    except (ValueError, TypeError):
-        raise ValueError(
-            f"--dataset is {name!r}; the rule of Minari is NAME-vNUMBER or SPACE/NAME-vNUMBER, of letters, digits, _ "
-            "and -, SPACE of at least two"
-        ) from None
-    if get_dataset_path(name).exists():
-        raise ValueError(
-            f"--dataset {name} is there already ({get_dataset_path(name)}): raise its version, or remove it"
-        )
-
-
 def write_dataset(
-    episodes: Sequence[RecordedEpisode], env: gym.Env, name: str, *, algorithm_name: str, author: str = "surgsim"
+    episodes: Sequence[RecordedEpisode], env: gym.Env, name: str, *, algorithm_name: str
 ) -> minari.MinariDataset:
     """Write episodes as a Minari dataset with the spec of its environment.
 
@@ -260,15 +218,13 @@ def write_dataset(
         env: of the episodes; made with gym.make.
         name: of the dataset, such as "surgsim/retract/oracle-v0".
         algorithm_name: of the player.
-        author: of the dataset.
 
     Raises:
-        ValueError: no episode, an environment that was not made with gym.make, or a name that is taken.
+        ValueError: no episode, or a name that is taken.
     """
     if not episodes:
         raise ValueError("there is no episode to write: none was played, or none succeeded (--keep-failures)")
-    if env.spec is None:
-        raise ValueError("the environment has no spec, so the dataset could not recover it: make it with gym.make")
+    assert env.spec is not None
     # The dataset may be used on a machine without a display.
     spec = copy.deepcopy(env.spec)
     spec.kwargs.pop("render_mode", None)
@@ -280,7 +236,7 @@ def write_dataset(
             [episode.buffer(index, env.observation_space) for index, episode in enumerate(episodes)],
             env=spec,
             algorithm_name=algorithm_name,
-            author=author,
+            author="surgsim",
             code_permalink=CODE,
             description=f"{len(episodes)} episodes of {spec.id} by {algorithm_name}",
             requirements=["surgsim"],
@@ -293,7 +249,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", help="the environment's id, such as SurgSim/Retract-v0")
     parser.add_argument("--env-arguments", type=json.loads, default={}, help='as JSON: \'{"scene": "phantom"}\'')
-    parser.add_argument("--by", default="oracle", help="oracle, keyboard, a policy's NAME.json, or MODULE:CLASS")
+    parser.add_argument("--by", default="oracle", help="oracle, a policy's NAME.json, or MODULE:CLASS")
     parser.add_argument("--episodes", type=int, default=10, help="number of episodes to play")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--keep-failures", action="store_true", help="write the episodes that failed too")
@@ -311,7 +267,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if given.images:
         raise ValueError("--images is for --format lerobot: add it, or leave --images out")
-    check_dataset_name(given.dataset)
+    if get_dataset_path(given.dataset).exists():
+        raise ValueError(f"--dataset {given.dataset} is there already: raise its version, or remove it")
     env = gym.make(given.env, **given.env_arguments)
     dataset = write_dataset(list(_episodes(given, env)), env, given.dataset, algorithm_name=who)
     print(
@@ -356,5 +313,4 @@ def _record_lerobot(given: argparse.Namespace, who: str) -> None:
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__, "agents", "demonstrations"):
-        main()
+    main()

@@ -1,4 +1,4 @@
-"""Record the faces of organs, on which a site policy trains at thousands of presses a second; a stopped run continues.
+"""Record the faces of organs, on which a site policy trains at thousands of presses a second.
 
 python -m agents.record_faces --scene liver_family --split train --faces 128 --out runs/liver_faces.npz
 
@@ -8,12 +8,11 @@ Of `liver_family`, 128 faces take 80 to 120 minutes of processor time.
 import argparse
 from pathlib import Path
 
-from agents.command_line import one_line_errors
 from surgsim_env.training.recorded_faces import LANES, record_faces
 
 
 def main() -> None:
-    """Record, or continue a recording."""
+    """Record."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="liver_family")
     parser.add_argument("--split", help="of a family, train by default")
@@ -21,16 +20,15 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=128, help=f"at least so many, in batches of {LANES}")
     parser.add_argument("--out", type=Path, default=Path("runs/faces.npz"))
     arguments = parser.parse_args()
-    record_faces(
-        arguments.out,
+    faces = record_faces(
         arguments.scene,
         arguments.split,
         arguments.level,
         arguments.faces,
         progress=lambda done: print(f"{done} of {arguments.faces} faces", flush=True),
     )
+    faces.save(arguments.out)
 
 
 if __name__ == "__main__":
-    with one_line_errors(__name__):
-        main()
+    main()

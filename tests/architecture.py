@@ -40,15 +40,13 @@ ORDER = {
     ),
     # One script each.
     "agents": (
-        *("__init__", "command_line", "raster", "keyboard", "record_faces", "learn_from_scratch"),
+        *("__init__", "record_faces", "learn_from_scratch"),
         *("learn_palpate_organs", "learn_retract", "learn_sites"),
         *(
             "envhub",
             "lerobot_dataset",
             "record_demonstrations",
             "behaviour_cloning",
-            "train_rllib",
-            "leaderboard_tables",
             "leaderboard",
         ),
     ),

@@ -260,7 +260,7 @@ def press_liver() -> Parts:
     """A press of the liver at a place of its palpable face, as `surgsim palpate` does it."""
     anatomy = surgsim_env.load_anatomy(surgsim_env.make_scene("liver"))
     site, normal = anatomy.face.random_point(np.random.default_rng(3), 0.01)
-    (pressed,) = scan(anatomy, anatomy.organ(), site[None], normal[None], workers=1)
+    (pressed,) = scan(anatomy, anatomy.organ(), site[None], normal[None])
     return {"press": [vars(pressed)]}
 
 

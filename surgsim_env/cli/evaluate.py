@@ -13,7 +13,7 @@ from surgsim_env.scoring.options import ScoringOptions
 class Evaluate:
     """Score a method on fixed seeds: a search or a script by name, a trained policy, or an agent of your own.
 
-    Give one of --agent, --policy, --all, --reach and --compare. Results, the agents' interface and what makes
+    Give one of --agent, --policy, --all and --compare. Results, the agents' interface and what makes
     a score comparable: docs/own_agent.md. Reading a policy's files runs no code of its author.
     """
 
@@ -23,31 +23,21 @@ class Evaluate:
     """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
-    reach: bool = False
-    """Count the lesions below the sensor's reach."""
-    compare: tuple[str, str] | None = None
-    """Two methods of --results on this scene and level, or two files."""
+    compare: tuple[Path, Path] | None = None
+    """Result files of two methods on the same episodes."""
     played: ScoringOptions = field(default_factory=ScoringOptions)
 
     def run(self, console: Console) -> int:
         """Play, print and write; returns 0.
 
         Raises:
-            ValueError: not one of the five, options that do not go with it, a missing package, an unknown method.
+            ValueError: not one of the four, options that do not go with it, a missing package, an unknown method.
         """
-        asked = [name for name in ("agent", "policy", "all", "reach", "compare") if getattr(self, name)]
+        asked = [name for name in ("agent", "policy", "all", "compare") if getattr(self, name)]
         if len(asked) != 1:
             told = " and ".join(f"--{name}" for name in asked) or "none"
-            raise ValueError(f"give one of --agent, --policy, --all, --reach, --compare; given: {told}")
+            raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {told}")
         options = self.played
-        if options.submit is not None and self.agent is None and self.policy is None:
-            raise ValueError("--submit writes one result: give --agent or --policy as well")
-        ignored = [name for name in ("motion", "budget", "no_tracking") if getattr(options, name)]
-        if self.reach and ignored:
-            raise ValueError(
-                f"--reach presses an organ that holds still, with and without each lesion: leave out "
-                f"--{ignored[0].replace('_', '-')}"
-            )
         if (options.env or options.env_kwargs) and ":" not in (self.agent or ""):
             raise ValueError(
                 "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
@@ -61,8 +51,6 @@ class Evaluate:
                 evaluate.evaluate(evaluate.policy_player(Path(self.policy), options), options, console)
             elif self.all:
                 evaluate.evaluate_all(options, console)
-            elif self.reach:
-                evaluate.write_reach(options, console)
             elif self.compare is not None:
-                evaluate.print_comparison(*self.compare, options, console)
+                evaluate.print_comparison(*self.compare, console)
         return 0

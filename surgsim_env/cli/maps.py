@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from rich.console import Console
 
 from surgsim_env.palpation.member_map import member_map, still_template
-from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import MemberName
 from surgsim_env.scene.family import family_of
 from surgsim_env.scene.load import make_scene
@@ -32,8 +31,7 @@ class Maps:
         template = still_template(make_scene(self.scene))
         family = family_of(template, self.split)
         assert family is not None
-        with StepProgress(console) as progress:
-            for number in range(family.size):
-                member_map(template, MemberName(self.split, number), progress)
+        for number in range(family.size):
+            member_map(template, MemberName(self.split, number))
         console.print(f"maps of {family.size} members of {self.scene}, split {self.split}", highlight=False)
         return 0

@@ -7,7 +7,6 @@ import tyro
 from rich.console import Console
 
 from surgsim_env.cli.values import (
-    MaybeCount,
     MaybeNumber,
     MaybePath,
     MaybeText,
@@ -63,8 +62,6 @@ class Palpate:
     """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
     seed: int = 0
     """Seed of the sensor's noise and of the pre-operative model's errors."""
-    workers: MaybeCount = None
-    """Number of threads; default: one for each core."""
 
     @property
     def options(self) -> SceneOptions:
@@ -97,9 +94,7 @@ class Palpate:
                     for lesion in lesions:
                         anatomy.check_inside(lesion)
                 anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-            found = run_palpation(
-                anatomy, lesions=lesions, around=around, seed=self.seed, workers=self.workers, console=console
-            )
+            found = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, console=console)
             with StepProgress(console) as progress, progress.step("drawing the map"):
                 write_csv(found, files / CSV_NAME)
                 write_summary(found, files / SUMMARY_NAME, vars(self))

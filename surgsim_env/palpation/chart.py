@@ -2,10 +2,7 @@
 
 import contextlib
 import os
-import threading
-import zipfile
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -15,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.lane_group import LaneGroup, core_count
+from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import SitePress, press_in_lanes, press_phases
+from surgsim_env.palpation.press import SitePress, in_threads, press_in_lanes, press_phases
 from surgsim_env.palpation.scene_options import with_substeps
 from surgsim_env.reports.output_folder import output_folder
 from surgsim_env.reports.step_progress import StepProgress
@@ -350,31 +347,28 @@ def quickened(anatomy: Anatomy, progress: StepProgress) -> Anatomy:
 @lru_cache(maxsize=8)
 def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
     """`healthy_map` of an anatomy that is loaded, with the scene's probe."""
-    scene, digest, folder = anatomy.scene, map_digest(anatomy), cache_folder()
+    scene, digest = anatomy.scene, map_digest(anatomy)
     beside = healthy_file(scene.folder / f"{scene.name}.toml")
     grid = _shipped(beside, digest)
     if grid is not None:
         return HealthyMap(grid)
     # As members of a family, whose maps are made from this one.
     is_quick = scene.family is not None or beside.is_file()
-    path = None if folder is None else folder / f"healthy-{digest}{'-quick' * is_quick}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):
-        if path is not None:
-            return HealthyMap(np.load(path, allow_pickle=False))
+    path = cache_folder() / f"healthy-{digest}{'-quick' * is_quick}.npy"
+    if path.is_file():
+        return HealthyMap(np.load(path, allow_pickle=False))
     with StepProgress.on_stderr() as progress:
         grid = _pressed(quickened(anatomy, progress), progress, np.float32) if is_quick else _pressed(anatomy, progress)
-    if path is not None:
-        keep_map(path, grid)
+    keep_map(path, grid)
     return HealthyMap(grid)
 
 
 def _shipped(path: Path, digest: str) -> FloatArray | None:
-    """The map beside a scene file; None if there is none, or it is of another organ or version, or broken."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return archive["grid"] if str(archive["digest"]) == digest else None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+    """The map beside a scene file; None if there is none, or it is of another organ or version."""
+    if not path.is_file():
         return None
+    with np.load(path, allow_pickle=False) as archive:
+        return archive["grid"] if str(archive["digest"]) == digest else None
 
 
 def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64) -> FloatArray:
@@ -403,40 +397,20 @@ def press_sites(
     """
     phases, lanes = press_phases(anatomy.scene), LANES[dtype]
     batches = [sites[first : first + lanes] for first in range(0, len(sites), lanes)]
-    threads = min(core_count(), len(batches))
-    stopped = threading.Event()
 
-    stiffness = np.zeros(len(sites))
+    def group() -> LaneGroup:
+        return LaneGroup([Simulation(anatomy) for _ in range(lanes)], dtype)
 
-    def press(number: int, advance: Callable[[int], None]) -> None:
-        """Every so many batches, from one of these numbers on, in one thread."""
-        simulations = [Simulation(anatomy) for _ in range(lanes)]
-        group = LaneGroup(simulations, dtype)
-        try:
-            for first, batch in list(zip(range(0, len(sites), lanes), batches, strict=True))[number::threads]:
-                if stopped.is_set():
-                    break
-                presses = [
-                    SitePress(one, site.point, site.normal) for one, site in zip(simulations, batch, strict=False)
-                ]
-                press_in_lanes(group, [*presses, *[None] * (lanes - len(presses))], phases)
-                stiffness[first : first + len(batch)] = [_stiffness(anatomy, one) for one in presses]
-                advance(len(batch))
-        except BaseException:
-            stopped.set()
-            raise
+    def press(own: LaneGroup, number: int) -> list[float]:
+        batch = batches[number]
+        presses = [SitePress(one, site.point, site.normal) for one, site in zip(own.simulations, batch, strict=False)]
+        press_in_lanes(own, [*presses, *[None] * (lanes - len(presses))], phases)
+        advance(len(batch))
+        return [_stiffness(anatomy, one) for one in presses]
 
-    with (
-        progress.step(f"pressing the healthy organ {name}".strip(), len(sites)) as advance,
-        ThreadPoolExecutor(threads) as pool,
-    ):
-        try:
-            list(pool.map(press, range(threads), [advance] * threads))
-        except BaseException:
-            # Ctrl-C, or an error in one thread: the others end after their current presses.
-            stopped.set()
-            raise
-    return stiffness
+    with progress.step(f"pressing the healthy organ {name}".strip(), len(sites)) as advance:
+        stiffness = in_threads(group, press, len(batches))
+    return np.array([value for batch in stiffness for value in batch])
 
 
 def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
@@ -464,21 +438,13 @@ def map_digest(anatomy: Anatomy) -> str:
     return content_digest(anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors, parts, instrument, PHYSICS_VERSION)
 
 
-def cache_folder() -> Path | None:
-    """The cache's folder; None for an account without a home."""
+def cache_folder() -> Path:
+    """The cache's folder."""
     named = os.environ.get(FOLDER_VARIABLE)
-    if named:
-        return Path(named)
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim"
-    except RuntimeError:
-        return None
+    return Path(named or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim")
 
 
 def keep_map(path: Path, grid: FloatArray) -> None:
     """Write the map atomically; a folder that is not writable is ignored."""
-    try:
-        with output_folder(path.parent) as files:
-            np.save(files / path.name, grid, allow_pickle=False)
-    except OSError:
-        return
+    with contextlib.suppress(OSError), output_folder(path.parent) as files:
+        np.save(files / path.name, grid, allow_pickle=False)

@@ -50,17 +50,15 @@ class Hold:
         found = []
         worst = int(np.argmax(self.far_share))
         if self.far_share[worst] > FAR_SHARE_LARGEST:
-            value, rule = _told_apart(float(self.far_share[worst]), FAR_SHARE_LARGEST, digits=0, kind="%")
             found.append(
-                f"the organ sways: pressed at {_place(self.sites[worst])} mm, its far side moves by {value} of the "
-                f"tip's depth; the rule is at most {rule}"
+                f"the organ sways: pressed at {_place(self.sites[worst])} mm, its far side moves by "
+                f"{self.far_share[worst]:.1%} of the tip's depth; the rule is at most {FAR_SHARE_LARGEST:.0%}"
             )
         share = float(np.median(self.force_share))
         if share < FORCE_SHARE_LEAST:
-            value, rule = _told_apart(share, FORCE_SHARE_LEAST, digits=2, kind="f")
             found.append(
-                f"presses move the organ in place of denting it: they feel {value} of Hertz's force (median), the rule "
-                f"is at least {rule}"
+                f"presses move the organ in place of denting it: they feel {share:.2f} of Hertz's force (median), the "
+                f"rule is at least {FORCE_SHARE_LEAST:g}"
             )
         return tuple(f"{one}; lesions may be missed: {WAYS}" for one in found)
 
@@ -102,7 +100,6 @@ def check_hold(
     normals: FloatArray,
     *,
     progress: Callable[[], None] = lambda: None,
-    workers: int | None = None,
 ) -> Hold | None:
     """Press up to SITES of some sites of the healthy organ, spread over them; see `hold_of`.
 
@@ -111,17 +108,10 @@ def check_hold(
         sites: to choose from [m], shape (n_site, 3).
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
-        workers: threads; all cores by default.
     """
     chosen = np.unique(np.linspace(0, len(sites) - 1, SITES).round().astype(int))
-    presses = scan(anatomy, anatomy.organ(), sites[chosen], normals[chosen], progress=progress, workers=workers)
+    presses = scan(anatomy, anatomy.organ(), sites[chosen], normals[chosen], progress=progress)
     return hold_of(anatomy, presses)
-
-
-def _told_apart(value: float, rule: float, *, digits: int, kind: str) -> tuple[str, str]:
-    """Texts of two different numbers, with more decimals than `digits` where it takes them to see which is larger."""
-    texts = f"{value:.{digits}{kind}}", f"{rule:.{digits}{kind}}"
-    return texts if texts[0] != texts[1] else _told_apart(value, rule, digits=digits + 1, kind=kind)
 
 
 def _place(point: FloatArray) -> str:

@@ -29,7 +29,7 @@ from surgsim_env.palpation.contrast_map import (
     score_map,
 )
 from surgsim_env.palpation.hold import Hold, hold_of
-from surgsim_env.palpation.misses import HEALTHY_FEWEST, Miss, PressedSites, explain_misses
+from surgsim_env.palpation.misses import Miss, explain_misses
 from surgsim_env.palpation.press import Press, scan
 from surgsim_env.palpation.truth import Truth, seen_from_surface
 from surgsim_env.scene.anatomy import SUPPORT_TIP_RADII, Anatomy
@@ -38,8 +38,6 @@ from surgsim_env.scene.palpable_surface import (
     PalpableFace,
     contact_radius,
     hidden_share,
-    hidden_text,
-    share_text,
     tangent_axes,
 )
 
@@ -108,7 +106,6 @@ def run_palpation(
     lesions: Sequence[Lesion] | None = None,
     around: Ball | None = None,
     seed: int = 0,
-    workers: int | None = None,
     console: Console | None = None,
 ) -> PalpationResult:
     """Palpate a scene's organ; the same scene, lesions and seed give the same result.
@@ -118,7 +115,6 @@ def run_palpation(
         lesions: hidden in the organ; the scene's demonstration lesions by default.
         around: press only the raster sites inside this ball.
         seed: of sensor noise and of the errors of the pre-operative model.
-        workers: threads; all cores by default.
         console: where the progress bar is shown; nowhere by default.
 
     Raises:
@@ -134,11 +130,9 @@ def run_palpation(
     organ, model = anatomy.organ(hidden), anatomy.organ(modulus_factor=factor)
     model_sites, model_normals = _displaced(anatomy.face, sites, normals, rng)
     with press_progress(console) as bar:
-        presses = scan(
-            anatomy, organ, sites, normals, workers=workers, progress=progress_task(bar, "organ", len(sites))
-        )
+        presses = scan(anatomy, organ, sites, normals, progress=progress_task(bar, "organ", len(sites)))
         step = progress_task(bar, "its pre-operative model", len(sites))
-        model_presses = scan(anatomy, model, model_sites, model_normals, workers=workers, progress=step)
+        model_presses = scan(anatomy, model, model_sites, model_normals, progress=step)
         reading = _read(presses, scene.sensor, rng)
         model_reading = _read(model_presses, scene.sensor, rng)
         complete = np.array([not (one.end or two.end) for one, two in zip(presses, model_presses, strict=True)])
@@ -159,7 +153,8 @@ def run_palpation(
             hidden,
             truths,
             maps,
-            PressedSites(sites[used], sites[~used], scene.palpation.site_spacing),
+            sites[used],
+            sites[~used],
             progress=lambda count: progress_task(bar, "over missed lesions", count),
         )
     return PalpationResult(
@@ -310,8 +305,8 @@ def early_end(palpation: PalpationResult, index: int) -> str:
     return "" if palpation.used[index] else "force reading not above 0"
 
 
-def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Write and return the summary; undefined numbers, such as the error of a missed lesion, are null."""
+def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, Any]) -> None:
+    """Write the summary; undefined numbers, such as the error of a missed lesion, are null."""
     scene, mesh = palpation.anatomy.scene, palpation.anatomy.mesh
     forces = [press.force_peak for press in palpation.presses]
     summary = {
@@ -358,9 +353,7 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
         "wall_time_s": palpation.wall_time,
         "real_time_factor": palpation.simulated_time / palpation.wall_time,
     }
-    plain = plain_json(summary)
-    path.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return plain
+    path.write_text(json.dumps(plain_json(summary), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _held_entry(hold: Hold | None) -> dict[str, Any] | None:
@@ -395,7 +388,6 @@ def _map_entry(one: ContrastMap, misses: Sequence[Miss]) -> dict[str, Any]:
         "false_alarms": one.false_alarms,
         "healthy_sites": one.healthy_count,
         "healthy_std": one.healthy_std,
-        "healthy_robust_std": one.healthy_robust_std,
     }
 
 
@@ -422,38 +414,16 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         for miss in palpation.misses:
             if miss.map_name == one.name:
                 console.print(f"  {miss.lesion}: {miss.text}", highlight=False, markup=False)
-    fewest = min(one.healthy_count for one in palpation.maps)
-    if fewest < HEALTHY_FEWEST:
-        console.print(
-            f"weak baseline: {fewest} healthy sites, the rule is at least {HEALTHY_FEWEST}: press more sites (smaller "
-            "--spacing, no --around)"
-        )
     if palpation.hold is not None:
         console.print(f"held: {palpation.hold.text}", highlight=False)
         for fault in palpation.hold.faults:
             # Markup would take [[anchors]] for a style.
             console.print(f"not held well: {fault}", highlight=False, markup=False)
     early = int((~palpation.used).sum())
-    every = (*palpation.presses, *palpation.model_presses)
     console.print(
         f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not "
-        f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N, "
-        f"smallest volume ratio {min(press.volume_ratio_smallest for press in every):.2f}"
+        f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N"
     )
-    console.print(
-        f"largest contact pressure {1e-3 * max(press.load.pressure for press in palpation.presses):.2f} kPa, largest "
-        f"strain of the tissue {100.0 * max(press.load.strain for press in palpation.presses):.0f} %"
-    )
-    scene = palpation.anatomy.scene
-    share = share_text(palpation.anatomy.palpable_cell, scene.instrument.tip_radius, scene.palpation.press_depth)
-    console.print(f"cell / contact radius {share}")
-    console.print(hidden_text(*_touch(palpation)))
-    console.print(
-        f"simulated {palpation.simulated_time:.1f} s in {palpation.wall_time:.1f} s: "
-        f"{palpation.simulated_time / palpation.wall_time:.2f} times real time"
-    )
-    for index in np.flatnonzero(~palpation.used).tolist():
-        console.print(f"  site {index} ended early: {early_end(palpation, index)}")
 
 
 def _touch(palpation: PalpationResult) -> tuple[float, float, float, float]:

@@ -146,20 +146,10 @@ class LesionEstimator:
         lesion_radius: mean radius of the lesions that are looked for [m]; the model's lengths scale with it.
         noise: standard deviation of one log contrast by the sensor: its noise over the force of a healthy press.
         map_spread: standard deviation of the log contrast of healthy presses about the map, 0 on a block.
-
-    Raises:
-        ValueError: an extent or lesion_radius that is not above 0, a noise or map_spread below 0.
     """
 
     def __init__(self, extent: ArrayLike, *, lesion_radius: float, noise: float, map_spread: float = 0.0) -> None:
         self.extent = np.asarray(extent, dtype=np.float64)
-        if self.extent.shape != (2,) or not (np.isfinite(self.extent) & (self.extent > 0.0)).all():
-            raise ValueError(f"extent is {extent}; it must be two lengths above 0 in metres")
-        if not 0.0 < lesion_radius < np.inf:
-            raise ValueError(f"lesion_radius is {lesion_radius:g} m; it must be above 0")
-        for name, value in (("noise", noise), ("map_spread", map_spread)):
-            if not 0.0 <= value < np.inf:
-                raise ValueError(f"{name} is {value:g}; it must be a standard deviation of log contrast, 0 or more")
         self.lesion_radius, self.noise = lesion_radius, noise
         self.scale = lesion_radius / REFERENCE_LESION_RADIUS
         self.excess_least = EXCESS_LEAST + EXCESS_LEAST_NOISE * noise + EXCESS_LEAST_MAP * map_spread
@@ -175,16 +165,9 @@ class LesionEstimator:
         Args:
             places: of the presses on the chart [m], shape (n, 2).
             log_contrast: log of stiffness over healthy stiffness, shape (n,).
-
-        Raises:
-            ValueError: shapes that do not belong together, or a number that is not finite.
         """
         places = np.asarray(places, dtype=np.float64).reshape(-1, 2)
         values = np.asarray(log_contrast, dtype=np.float64)
-        if values.shape != (len(places),):
-            raise ValueError(f"{len(places)} places but log contrasts of shape {values.shape}; give one for each")
-        if not (np.isfinite(places).all() and np.isfinite(values).all()):
-            raise ValueError("a place or a log contrast is not finite: leave out presses that ended in a fault")
         background, excess = self.process.mean(places, values)
         points, strength = self._maxima(excess)
         return LesionEstimate(points, strength, background, excess, self._outline(excess, points, strength), self.axes)

@@ -6,9 +6,7 @@ fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25) continues log r from
 to all.
 """
 
-import contextlib
-from collections import OrderedDict
-from threading import Lock
+from functools import lru_cache
 
 import numpy as np
 
@@ -44,60 +42,36 @@ RATIO_TERMS, PRESS_SPREAD = ((0.15, 0.5), (0.05, 0.08)), 0.015
 # Members whose maps are kept in memory, 5 kB each.
 MAPS_MOST = 1000
 
-_maps: OrderedDict[tuple[Anatomy, MemberName], HealthyMap] = OrderedDict()
-_lock = Lock()
-
 
 def still_template(scene: Scene) -> Anatomy:
     """The anatomy whose healthy map belongs to a scene: with the probe, and without motion."""
     return load_anatomy(with_instrument(with_motion(scene, STILL), "probe"))
 
 
-def member_map(template: Anatomy, name: MemberName, progress: StepProgress | None = None) -> HealthyMap:
-    """The healthy map of a member of a family, from memory, the cache on disk (`chart.healthy_map`) or by pressing it.
+@lru_cache(maxsize=MAPS_MOST)
+def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
+    """The healthy map of a member of a family, from the cache on disk (`chart.healthy_map`) or by pressing it.
 
     Args:
         template: `still_template` of the family's scene.
         name: of the member.
-        progress: shows the presses; None: on standard error.
 
     Raises:
         ValueError: as in `healthy_map`.
     """
-    key = template, name
-    with _lock:
-        known = _maps.pop(key, None)
-        if known is None:
-            known = _read_or_press(make_member(template, name), progress)
-        _maps[key] = known
-        if len(_maps) > MAPS_MOST:
-            _maps.popitem(last=False)
-    return known
-
-
-def _read_or_press(member: Anatomy, progress: StepProgress | None) -> HealthyMap:
-    template, folder = member.template, cache_folder()
-    assert template is not None
-    digest = content_digest(map_digest(template), map_digest(member))
-    path = None if folder is None else folder / f"healthy-{digest}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):
-        if path is not None:
-            return HealthyMap(np.load(path, allow_pickle=False))
-    base_map = healthy_map_of(template)
-    if progress is not None:
-        grid = _corrected(base_map, member, progress)
-    else:
-        with StepProgress.on_stderr() as own:
-            grid = _corrected(base_map, member, own)
-    if path is not None:
-        keep_map(path, grid)
+    member = make_member(template, name)
+    path = cache_folder() / f"healthy-{content_digest(map_digest(template), map_digest(member))}.npy"
+    if path.is_file():
+        return HealthyMap(np.load(path, allow_pickle=False))
+    base = healthy_map_of(template)
+    with StepProgress.on_stderr() as progress:
+        grid = _corrected(base, member, template, progress)
+    keep_map(path, grid)
     return HealthyMap(grid)
 
 
-def _corrected(base: HealthyMap, member: Anatomy, progress: StepProgress) -> FloatArray:
+def _corrected(base: HealthyMap, member: Anatomy, template: Anatomy, progress: StepProgress) -> FloatArray:
     """The map of the template times the ratio that presses of the member show; stiffness [N/m], (m, m)."""
-    template = member.template
-    assert template is not None
     charted, own = charted_face(member), charted_face(template)
     every = charted.grid_sites()
     places = np.array([own.chart.place(member.face.carried(site.point, template.face)) for site in every])

@@ -11,14 +11,16 @@ from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.contrast_map import ContrastMap, LesionScore, smoothed
 from surgsim_env.palpation.press import scan
-from surgsim_env.palpation.scores import LesionReach
 from surgsim_env.palpation.truth import Truth, felt_weights, surface_points
 from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.model import Scene
 
 # A lesion is not under the pressed face where another point of the surface is pressed with so many times its strain.
 HIDDEN_RATIO = 2.0
 # A baseline from fewer healthy sites is weak.
 HEALTHY_FEWEST = 8
+# The sensor's noise hides a lesion that changes a press's force by less than this many of its standard deviations.
+NOISES_LEAST = 2.0
 
 NOT_FACED, NEAR_SUPPORT, NO_SITE, NOISE, TOO_DEEP, NO_MAXIMUM = (
     *("not under the pressed face", "too near a support", "no complete press near it", "below the sensor's noise"),
@@ -42,28 +44,14 @@ class Miss:
     text: str
 
 
-@dataclass(frozen=True, eq=False)
-class PressedSites:
-    """What the maps were made from.
-
-    Args:
-        sites: those in the maps [m], shape (n_site, 3).
-        ended_early: those whose presses ended early [m], shape (n, 3).
-        spacing: of the raster [m].
-    """
-
-    sites: FloatArray
-    ended_early: FloatArray
-    spacing: float
-
-
 def explain_misses(
     anatomy: Anatomy,
     organ: OrganModel,
     lesions: Sequence[Lesion],
     truths: Sequence[Truth],
     maps: Sequence[ContrastMap],
-    pressed: PressedSites,
+    sites: FloatArray,
+    ended_early: FloatArray,
     progress: Callable[[int], Callable[[], None]] | None = None,
 ) -> tuple[Miss, ...]:
     """The reason for each lesion that a map does not show; presses once with and once without each of those.
@@ -74,7 +62,8 @@ def explain_misses(
         lesions: in it.
         truths: their places, as in the maps' scores.
         maps: with scores.
-        pressed: sites of the maps.
+        sites: of the maps [m], shape (n_site, 3).
+        ended_early: sites whose presses ended early [m], shape (n, 3).
         progress: called with the number of presses; gives back what is called after each.
     """
     missed = [index for index in range(len(lesions)) if not all(one.scores[index].felt for one in maps)]
@@ -85,14 +74,15 @@ def explain_misses(
         hidden = _hidden(anatomy, lesions[index], truth)
         bare = anatomy.organ([lesion for number, lesion in enumerate(lesions) if number != index])
         force, force_without = (
-            scan(anatomy, model, truth.point[None], truth.normal[None], workers=1, progress=advance)[0].force
+            scan(anatomy, model, truth.point[None], truth.normal[None], progress=advance)[0].force
             for model in (organ, bare)
         )
-        reach = LesionReach(force, force_without, anatomy.scene.sensor.noise)
         for one in maps:
             if one.scores[index].felt:
                 continue
-            reason, text = _why(one, one.scores[index], reach, hidden, pressed)
+            reason, text = _why(
+                one, one.scores[index], (force, force_without), hidden, anatomy.scene, (sites, ended_early)
+            )
             if one.healthy_count < HEALTHY_FEWEST:
                 text += f"; the baseline is weak: {one.healthy_count} healthy sites, {HEALTHY_FEWEST} are the rule"
             misses.append(Miss(one.name, truth.name, reason, f"{reason}: {text}"))
@@ -119,27 +109,28 @@ def _hidden(anatomy: Anatomy, lesion: Lesion, truth: Truth) -> tuple[str, str] |
 def _why(
     one: ContrastMap,
     score: LesionScore,
-    reach: LesionReach,
+    forces: tuple[float, float],
     hidden: tuple[str, str] | None,
-    pressed: PressedSites,
+    scene: Scene,
+    pressed: tuple[FloatArray, FloatArray],
 ) -> tuple[str, str]:
-    truth, contrast = score.truth, reach.force / reach.force_without
-    felt = (
-        f"a press feels {reach.force:.3f} N, {reach.force_without:.3f} N without the lesion (contrast {contrast:.2f})"
-    )
+    truth, (force, force_without) = score.truth, forces
+    contrast = force / force_without
+    (sites, ended_early), spacing, noise = pressed, scene.palpation.site_spacing, scene.sensor.noise
+    felt = f"a press feels {force:.3f} N, {force_without:.3f} N without the lesion (contrast {contrast:.2f})"
     weak = contrast - 1.0 < one.threshold
     if hidden is not None and weak:
         return hidden
-    away = norm(pressed.sites - truth.point, axis=1)
-    if away.min() > pressed.spacing:
-        early = norm(pressed.ended_early - truth.point, axis=1) <= pressed.spacing
+    away = norm(sites - truth.point, axis=1)
+    if away.min() > spacing:
+        early = norm(ended_early - truth.point, axis=1) <= spacing
         said = f"{int(early.sum())} presses near it ended early, " if early.any() else ""
         return NO_SITE, f"{said}the nearest site of the map is {away.min() * 1e3:.1f} mm away"
-    if reach.below:
-        return NOISE, f"{felt}; the sensor's noise is {reach.noise:g} N"
+    if abs(force - force_without) < NOISES_LEAST * noise:
+        return NOISE, f"{felt}; the sensor's noise is {noise:g} N"
     if weak:
         return TOO_DEEP, f"{felt}; this map shows what exceeds its surroundings by {one.threshold:.2f}"
-    level = float(smoothed(pressed.sites, one.contrast, spacing=pressed.spacing)[int(np.argmin(away))])
+    level = float(smoothed(sites, one.contrast, spacing=spacing)[int(np.argmin(away))])
     return NO_MAXIMUM, (
         f"{felt}, but the smoothed contrast of the nearest site, {away.min() * 1e3:.1f} mm away, is {level:.2f} "
         f"and no maximum within its radius of {truth.radius * 1e3:.1f} mm exceeds its surroundings by "

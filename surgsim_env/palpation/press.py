@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ AVERAGE_TIME = 0.04
 FOLLOWING_TIME = 0.010
 # Interval of the readings that `press_phases` averages [s]; `recorded_phases` reads every haptic step.
 READING_TIME = 0.010
+
+Tool, Result = TypeVar("Tool"), TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -295,9 +298,8 @@ def scan(
     normals: FloatArray,
     *,
     progress: Callable[[], None] = lambda: None,
-    workers: int | None = None,
 ) -> list[Press]:
-    """Press each site of a resting organ; presses are independent, so the result does not depend on the workers.
+    """Press each site of a resting organ, on all cores; presses are independent: the result does not depend on them.
 
     Args:
         anatomy: the scene's organ.
@@ -305,35 +307,33 @@ def scan(
         sites: surface points [m], shape (n_site, 3).
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
-        workers: threads (the kernels hold no interpreter lock); all cores by default.
-
-    Raises:
-        ValueError: workers below 1.
     """
-    if workers is not None and workers < 1:
-        raise ValueError(f"workers is {workers}; it must be at least 1, or left out for one per core")
-    count = min(workers or core_count(), max(1, len(sites)))
-    stopped = threading.Event()
-    presses: list[Press | None] = [None] * len(sites)
 
-    def run(first: int) -> None:
-        simulation = Simulation(anatomy)
-        simulation.reset(organ_model, sites[0] + normals[0] * 0.05)
-        try:
-            for index in range(first, len(sites), count):
-                if stopped.is_set():
-                    break
-                presses[index] = press(simulation, sites[index], normals[index])
-                progress()
-        except BaseException:
-            stopped.set()
-            raise
+    def simulation() -> Simulation:
+        made = Simulation(anatomy)
+        made.reset(organ_model, sites[0] + normals[0] * 0.05)
+        return made
 
-    with ThreadPoolExecutor(count) as pool:
-        try:
-            list(pool.map(run, range(count)))
-        except BaseException:
-            # Ctrl-C, or an error in one thread: the others end after their current press.
-            stopped.set()
-            raise
-    return [one for one in presses if one is not None]
+    def pressed(own: Simulation, index: int) -> Press:
+        done = press(own, sites[index], normals[index])
+        progress()
+        return done
+
+    return in_threads(simulation, pressed, len(sites))
+
+
+def in_threads(make: Callable[[], Tool], work: Callable[[Tool, int], Result], count: int) -> list[Result]:
+    """Results of `work` for all numbers below `count`, on all cores; each thread makes a tool of its own for it.
+
+    An error, or Ctrl-C, cancels the calls that have not begun.
+    """
+    own = threading.local()
+
+    def run(number: int) -> Result:
+        if not hasattr(own, "tool"):
+            own.tool = make()
+        return work(own.tool, number)
+
+    # The kernels hold no interpreter lock.
+    with ThreadPoolExecutor(core_count()) as pool:
+        return list(pool.map(run, range(count)))

@@ -1,16 +1,14 @@
-"""Scores of palpation: OSPA, the figures of a method over many organs with their intervals, and the sensor's reach."""
+"""Scores of palpation: OSPA, and the figures of a method over many organs with their intervals."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.press import scan
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan
+from surgsim_env.scene.levels import REFERENCE_TIP
 
 # Episodes that every method is scored on; no training and no tuning uses them.
 EVALUATION_SEEDS = range(1_000_000, 1_000_100)
@@ -24,8 +22,6 @@ ERROR_LINE = 0.005
 # Draws of the bootstrap and the percentiles of its interval [%].
 RESAMPLES = 2000
 INTERVAL = (2.5, 97.5)
-# A lesion is below the sensor's reach if it changes the force by less than this many standard deviations of the noise.
-NOISES_LEAST = 2.0
 
 
 def ospa_cutoff(tip_radius: float) -> float:
@@ -42,12 +38,7 @@ def ospa(truth: FloatArray, estimate: FloatArray, cutoff: float) -> float:
         truth: true places [m], shape (m, d).
         estimate: estimated places [m], shape (k, d).
         cutoff: c, the largest that a distance counts and what each point without a partner costs [m].
-
-    Raises:
-        ValueError: a cutoff that is not above 0.
     """
-    if not cutoff > 0.0:
-        raise ValueError(f"cutoff is {cutoff:g} m; it must be above 0")
     larger = max(len(truth), len(estimate))
     if larger == 0:
         return 0.0
@@ -130,12 +121,7 @@ def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Genera
 
     Errors are in mm. `presses_to_median` and `presses_to_p90` are over organs with at least one lesion, as recall,
     centroid error, outline and map are; `precision` over those with an estimate.
-
-    Raises:
-        ValueError: no episode.
     """
-    if len(records) == 0:
-        raise ValueError("there is no episode to score")
     errors = np.array([press_errors(record, budget) for record in records])
     columns = {"error_mm": errors[:, -1] * 1000.0, "error_of_presses_mm": errors.mean(axis=1) * 1000.0}
     columns |= {name: np.array([of(record) for record in records]) for name, of in EPISODE_FIGURES.items()}
@@ -167,26 +153,19 @@ def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) 
 
 
 def press_errors(record: PalpationRecord, budget: int) -> FloatArray:
-    """OSPA [m] after each press of a budget, shape (budget,); an episode that ended early keeps its last one.
-
-    Raises:
-        ValueError: more presses than the budget has, or none.
-    """
-    if not 0 < len(record.estimates) <= budget:
-        raise ValueError(f"{len(record.estimates)} estimates in an episode of {budget} presses: give one per press")
+    """OSPA [m] after each press of a budget, shape (budget,); an episode that ended early keeps its last one."""
     errors = [ospa(record.truth, estimate, record.cutoff) for estimate in record.estimates]
     return np.array(errors + [errors[-1]] * (budget - len(errors)))
 
 
-def presses_to_line(errors: FloatArray, percentile: float, line: float = ERROR_LINE) -> float:
-    """Presses until a percentile of the errors over organs is and stays at or below a line; infinity if it never is.
+def presses_to_line(errors: FloatArray, percentile: float) -> float:
+    """Presses until a percentile of the errors over organs is and stays at most ERROR_LINE; infinity if it never is.
 
     Args:
         errors: after each press [m], shape (n_organ, n_press).
         percentile: 50 for the median, 90 for the bad cases.
-        line: [m].
     """
-    above = np.flatnonzero(np.percentile(errors, percentile, axis=0) > line)
+    above = np.flatnonzero(np.percentile(errors, percentile, axis=0) > ERROR_LINE)
     if len(above) == 0:
         return 1.0
     return float(above[-1] + 2) if above[-1] + 1 < errors.shape[1] else math.inf
@@ -267,42 +246,3 @@ EPISODE_FIGURES: Mapping[str, Callable[[PalpationRecord], float]] = {
     "hard_limit_share": lambda record: float(record.hard_limit),
     "fault_share": lambda record: float(bool(record.fault)),
 }
-
-
-@dataclass(frozen=True)
-class LesionReach:
-    """Change of force that one lesion causes in a press directly over it.
-
-    Fields:
-        force, force_without: held at the scene's depth, with all lesions and without this one [N]
-        noise: standard deviation of the sensor [N]
-    """
-
-    force: float
-    force_without: float
-    noise: float
-
-    @property
-    def below(self) -> bool:
-        """Whether the sensor's noise hides it from a single press."""
-        return abs(self.force - self.force_without) < NOISES_LEAST * self.noise
-
-
-def lesion_reaches(anatomy: Anatomy, drawn: DrawnOrgan) -> list[LesionReach]:
-    """Press over each lesion of a drawn organ along the surface normal, as `scan` does.
-
-    Args:
-        anatomy: of the scene with its level's sensor.
-        drawn: the organ.
-    """
-    if not drawn.lesions:
-        return []
-    reaches = []
-    whole = drawn.compiled(anatomy)
-    for index, lesion in enumerate(drawn.lesions):
-        place, normal = anatomy.face.project(lesion.centre)  # type: ignore[arg-type]
-        others = drawn.lesions[:index] + drawn.lesions[index + 1 :]
-        without = replace(drawn, lesions=others).compiled(anatomy)
-        presses = [scan(anatomy, organ, place[None], normal[None], workers=1)[0] for organ in (whole, without)]
-        reaches.append(LesionReach(presses[0].force, presses[1].force, anatomy.scene.sensor.noise))
-    return reaches

@@ -98,13 +98,6 @@ class Window:
         time.sleep(max(0.0, self._next - time.monotonic()))
         self._next = max(self._next, time.monotonic() - self._period) + self._period
 
-    def held_keys(self) -> str:
-        """Capital letters and space of the keys that were held down at the last picture; none in a closed window."""
-        glfw, handle = self._context._glfw, self._context.handle
-        if self.closed:
-            return ""
-        return "".join(key for key in PLAYING_KEYS if glfw.get_key(handle, ord(key)) == glfw.PRESS)
-
     def close(self) -> None:
         """Close the window; may be called more than once."""
         if not self.closed:

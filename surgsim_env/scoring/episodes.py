@@ -7,11 +7,10 @@ given the task with the truth by its method `see`; no other is given it.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
@@ -45,17 +44,6 @@ class EpisodeActor(Protocol):
         ...
 
 
-class EpisodeRecord(Protocol):
-    """What is kept of an episode."""
-
-    def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
-        """Add a step; `over` is true for the last one."""
-        ...
-
-
-R = TypeVar("R", bound=EpisodeRecord)
-
-
 def make_envs(
     env_id: str, count: int, *, dtype: str = "float32", threads: int = 1, **kwargs: Any
 ) -> gym.vector.VectorEnv:
@@ -79,9 +67,9 @@ def play(
     actor: Actor | EpisodeActor,
     envs: gym.vector.VectorEnv,
     seeds: Sequence[int],
-    begin: Callable[[int, int], R],
+    begin: Callable[[int, int], Any],
     progress: Callable[[int], object] = lambda ended: None,
-) -> list[R]:
+) -> list[Any]:
     """Play an episode of each seed and return its record; where one ends the next seed begins.
 
     Environments for which no seed is left are paused (`LaneVectorEnv.pause`).
@@ -89,23 +77,13 @@ def play(
     Args:
         actor: what plays. An episode's record does not depend on the others where the actor's actions do not: those
             of an `EpisodeActor` may draw from the random numbers of each episode.
-        envs: with autoreset_mode="Disabled", so that each reset has its seed.
+        envs: of `make_envs`.
         seeds: of the episodes.
-        begin: makes the record of an episode from the index of its environment and its seed.
+        begin: makes the record of an episode from the index of its environment and its seed; its `note` takes steps.
         progress: called after each step with the number of episodes that ended.
-
-    Raises:
-        ValueError: another autoreset mode, or several environments that cannot be paused.
     """
-    mode, lanes = AutoresetMode(envs.metadata["autoreset_mode"]), envs.unwrapped
-    if mode is not AutoresetMode.DISABLED:
-        raise ValueError(f'autoreset_mode is {mode.value!r}; episodes of given seeds need "Disabled"')
-    if envs.num_envs > 1 and not hasattr(lanes, "pause"):
-        raise ValueError(
-            f"{envs.num_envs} environments of {type(lanes).__name__} cannot be paused where no seed is left: make them "
-            'with vectorization_mode="vector_entry_point"'
-        )
-    waiting, records = list(range(len(seeds))), dict[int, R]()
+    lanes = envs.unwrapped
+    waiting, records = list(range(len(seeds))), dict[int, Any]()
     playing: list[int | None] = [None] * envs.num_envs
     observations, begins = np.zeros(0), np.ones(envs.num_envs, dtype=np.bool_)
     while True:
@@ -164,21 +142,6 @@ class EpisodeFacts:
     hard_force: float
 
 
-class EpisodeAgent(Protocol):
-    """Plays one episode of an environment whose steps are control steps; each episode has an agent of its own.
-
-    For SurgSim/PalpateSites-v0, whose step is a press: `surgsim_env.training.site_agent.SiteAgent`.
-    """
-
-    def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
-        """Begin the episode."""
-        ...
-
-    def act(self, observation: Any) -> NDArray[np.float32]:
-        """The next action, shape (action_size,), for an observation as the environment gives it."""
-        ...
-
-
 def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeFacts:
     """The facts of an environment (its wrappers do not matter)."""
     single = env.unwrapped
@@ -209,14 +172,10 @@ def check_agent(agent: object, name: str) -> None:
         method: callable(getattr(type(agent), method, None))
         for method in ("reset", "act", "see", "estimate", "estimate_map")
     }
-    for method, why in (
-        ("reset", "begins an episode"),
-        ("act", "chooses an action"),
-        *((("see", "takes the task with the truth, as its class declares sees_truth = True"),) * sees_truth(agent)),
-        *((("estimate_map", "gives the map beside the places of its method estimate"),) * has["estimate"]),
-    ):
+    needed = ("reset", "act", *["see"] * sees_truth(agent), *["estimate_map"] * has["estimate"])
+    for method in needed:
         if not has[method]:
-            raise ValueError(f"{name} has no method {method}, which {why}: docs/own_agent.md says what an agent has")
+            raise ValueError(f"{name} has no method {method}: docs/own_agent.md says what an agent has")
     if has["see"] and not sees_truth(agent):
         raise ValueError(
             f"{name} has a method see, which takes the task with the truth, and its class does not declare "
@@ -231,7 +190,7 @@ class AgentActor:
         """Play agents that `make` gives.
 
         Args:
-            make: a `SiteAgent` or an `EpisodeAgent`.
+            make: an agent as docs/own_agent.md says.
             facts: gives an agent the constants of its environment, by default `SiteFacts`.
         """
         self.make, self.facts = make, facts
@@ -239,13 +198,8 @@ class AgentActor:
         self._idle = np.zeros(0, dtype=np.float32)
 
     def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
-        """Make the agent of an episode in environment `index`.
-
-        Raises:
-            ValueError: it is refused by `check_agent`.
-        """
+        """Make the agent of an episode in environment `index`."""
         agent = self.agents[index] = self.make()
-        check_agent(agent, f"agent {type(agent).__name__}")
         self._idle = np.zeros(env.action_space.shape, dtype=np.float32)
         agent.reset(rng, self.facts(env))
         if sees_truth(agent):
@@ -422,16 +376,8 @@ class SiteRecord:
         )
 
     def _own_places(self) -> NDArray[np.float64]:
-        """The agent's own estimate; a ValueError where it is no list of places."""
-        said = np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64)
-        if said.size == 0:
-            return np.zeros((0, 3))
-        if said.ndim != 2 or said.shape[1] != 3 or not np.isfinite(said).all():
-            raise ValueError(
-                f"agent {type(self.reference).__name__}: estimate gives {said.tolist()!r:.60}, shape {said.shape}; "
-                "the rule is places on the face [m], finite, shape (k, 3)"
-            )
-        return said
+        """The agent's own estimate."""
+        return np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64).reshape(-1, 3)
 
     def _own_map(self, made: MapScore) -> MapScore:
         """The agent's own map beside the truth, which only one that declares it sees."""

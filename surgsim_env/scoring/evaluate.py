@@ -1,17 +1,17 @@
 """Play a method on seeds, score it, and write the result: baselines, trained policies, agents of others.
 
 Results of the project's own methods on all evaluation seeds go to agents/results of a checkout, one file per method,
-scene and level. Other results are printed, and written where the options `results` or `submit` say.
+scene and level. Other results are printed, and written where the option `results` says.
 """
 
 import datetime
 import importlib
-import json
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +46,12 @@ from surgsim_env.scoring.options import ScoringOptions
 from surgsim_env.scoring.results import (
     SITES,
     Result,
-    family,
     load_result,
-    load_results,
-    place_name,
     seeds_text,
     shipped_results,
 )
 from surgsim_env.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
-from surgsim_env.training.site_agent import SiteAgent, site_facts
+from surgsim_env.training.site_agent import site_facts
 
 # Seed of the bootstrap.
 BOOTSTRAP_SEED = 0
@@ -74,22 +71,20 @@ class Player:
         name: of the method.
         actor: what plays; None: the oracle's script.
         env_id, kwargs: the environment.
-        command: that scores it.
+        chosen_by: the option of `surgsim evaluate` that names it, and its value.
         sees_truth: whether it may see what is hidden.
         own_estimate: whether its own estimate is scored.
         ours: whether its result belongs in agents/results.
-        check: refuses an environment that it cannot play.
     """
 
     name: str
     actor: Actor | EpisodeActor | None
     env_id: str
     kwargs: dict[str, Any]
-    command: str
+    chosen_by: tuple[str, str]
     sees_truth: bool = False
     own_estimate: bool = False
     ours: bool = True
-    check: Callable[[gym.Env], None] = lambda env: None
 
 
 @dataclass(frozen=True)
@@ -100,13 +95,11 @@ class TaskAgent:
         env_id: the environment's.
         make: the script, for the environment's arguments.
         kwargs: further arguments of the environment.
-        has_places: whether the environment takes `scene` and `level`.
     """
 
     env_id: str
     make: Callable[[dict[str, Any]], Actor]
     kwargs: dict[str, Any] = field(default_factory=dict)
-    has_places: bool = False
 
 
 def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
@@ -126,18 +119,17 @@ TASK_AGENTS = {
         "SurgSim/Palpate-v0",
         lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
         {"memory": True},
-        has_places=True,
     ),
-    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE, has_places=True),
-    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE, has_places=True),
+    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE),
+    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE),
 }
 
 
-# Environments whose oracle plays its script, and whether they take `scene` and `level`.
+# Environments whose oracle plays its script.
 ORACLES = {
-    "oracle_palpate": ("SurgSim/Palpate-v0", True),
-    "oracle_retract": ("SurgSim/Retract-v0", False),
-    "oracle_bimanual_retract": ("SurgSim/BimanualRetract-v0", False),
+    "oracle_palpate": "SurgSim/Palpate-v0",
+    "oracle_retract": "SurgSim/Retract-v0",
+    "oracle_bimanual_retract": "SurgSim/BimanualRetract-v0",
 }
 
 
@@ -169,21 +161,20 @@ def named_class(text: str, option: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise
-        raise ValueError(
-            f"{option} {text}: there is no module {error.name!r} on Python's path: run from its folder, or add that to "
-            "PYTHONPATH"
-        ) from None
+        raise ValueError(f"{option} {text}: there is no module {error.name!r} on Python's path") from None
     if not callable(getattr(found, name, None)):
-        raise ValueError(f"{option} {text}: {found.__file__ or module} has no class {name!r}")
+        raise ValueError(f"{option} {text}: {module} has no class {name!r}")
     return getattr(found, name)
 
 
-def strangers_agent(text: str, option: str) -> tuple[Callable[[], Any], Any]:
-    """What makes the agents of MODULE:CLASS, and one of them.
+def strangers_actor(text: str, option: str, env_id: str, env_kwargs: dict[str, Any]) -> AgentActor:
+    """The actor of the agents of MODULE:CLASS.
 
     Args:
         text: MODULE:CLASS.
         option: where it was given, for messages.
+        env_id: of the environment that it plays.
+        env_kwargs: of the environment, as an agent is given them.
 
     Raises:
         ValueError: as in `named_class` and `check_agent`, or it cannot be made without arguments.
@@ -194,18 +185,7 @@ def strangers_agent(text: str, option: str) -> tuple[Callable[[], Any], Any]:
     except TypeError as error:
         raise ValueError(f"{option} {text}: it is made without arguments, and that failed: {error}") from None
     check_agent(agent, f"{option} {text}: it")
-    return make, agent
-
-
-def find_agent(name: str) -> Callable[[], SiteAgent]:
-    """The factory of the site search with a name.
-
-    Raises:
-        ValueError: an unknown name (lists the known).
-    """
-    if name not in AGENTS:
-        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
-    return AGENTS[name]
+    return AgentActor(make, site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, env_kwargs))
 
 
 def evaluate_all(options: ScoringOptions, console: Console) -> None:
@@ -232,29 +212,26 @@ def find_player(name: str, options: ScoringOptions) -> Player:
     Raises:
         ValueError: an unknown name, or a class that is not there.
     """
-    command = f"surgsim evaluate --agent {name}"
+    chosen_by = ("--agent", name)
     if ":" in name:
         return _strangers_player(name, options)
     if name in ORACLES:
-        env_id, has_places = ORACLES[name]
-        kwargs = _places(options, PLACES if has_places else {})
-        return Player(name, None, env_id, kwargs, command + _place_options(kwargs), sees_truth=True)
+        env_id = ORACLES[name]
+        return Player(name, None, env_id, _places(options, _defaults(env_id)), chosen_by, sees_truth=True)
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
-        kwargs = _places(options, PLACES if script.has_places else {})
-        command += _place_options(kwargs)
-        kwargs |= script.kwargs
-        return Player(name, script.make(kwargs), script.env_id, kwargs, command)
-    make, kwargs = find_agent(name), _places(options, PLACES)
-    command += _place_options(kwargs)
+        kwargs = _places(options, _defaults(script.env_id)) | script.kwargs
+        return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by)
+    if name not in AGENTS:
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
+    make, kwargs = AGENTS[name], _places(options, PLACES)
     if name in REFERENCES:
         # Their estimates do not depend on the presses.
         kwargs["budget"] = 1
-    return Player(name, AgentActor(make), SITES, kwargs, command, *_declared(make()))
+    return Player(name, AgentActor(make), SITES, kwargs, chosen_by, *_declared(make()))
 
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
-    make, agent = strangers_agent(name, "--agent")
     env_id = options.env or SITES
     for argument in (*PLACES, "split", "motion", "budget"):
         if argument in options.env_kwargs and getattr(options, argument) is not None:
@@ -262,13 +239,15 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
     # A split that --env-arguments name is meant.
     kwargs = {**_places(options, own), **options.env_kwargs}
-    command = f"surgsim evaluate --agent {name}" + f" --env {env_id}" * (env_id != SITES)
-    command += f" --env-arguments '{json.dumps(options.env_kwargs)}'" * bool(options.env_kwargs)
-    command += _place_options(_places(options, {}))
-    facts = site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, _arguments(player, options))
-    actor = AgentActor(make, facts)
-    player = Player(name.replace(":", "."), actor, env_id, kwargs, command, *_declared(agent), ours=False)
-    return player
+    given = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
+    actor = strangers_actor(name, "--agent", env_id, given)
+    declared = _declared(actor.make())
+    return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, ours=False)
+
+
+def _defaults(env_id: str) -> dict[str, str]:
+    """Scene and level where options give none; of an environment without levels none."""
+    return PLACES if "Palpate" in env_id else {}
 
 
 def _declared(agent: Any) -> tuple[bool, bool]:
@@ -290,11 +269,6 @@ def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]
     return places
 
 
-def _place_options(kwargs: dict[str, Any]) -> str:
-    told = _without_folders(kwargs)
-    return "".join(f" --{name} {told[name]}" for name in (*PLACES, "split") if name in told)
-
-
 def policy_player(path: Path, options: ScoringOptions) -> Player:
     """A trained policy on its own environment, or on the scene and level of the options where it can play them.
 
@@ -314,23 +288,12 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     env_id = policy.description.env_id
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
     kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
-    command = f"surgsim evaluate --policy {_from_here(path)}"
-    # The level always, the scene where it is another than that of the training.
-    told = {name: value for name, value in kwargs.items() if name == "level" or value != own.get(name)}
     policy.reset(min(options.envs, len(options.played_seeds)))
 
-    def check(env: gym.Env) -> None:
-        policy.check_environment(env, f"policy {path}")
-
     return Player(
-        *(path.stem, policy, env_id, kwargs, command + _place_options(told)),
-        ours=_is_ours(path),
-        check=check,
+        *(path.stem, policy, env_id, kwargs, ("--policy", str(_from_here(path)))),
+        ours=path.resolve().parent == policies_folder(),
     )
-
-
-def _is_ours(path: Path) -> bool:
-    return path.resolve().parent == policies_folder()
 
 
 def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
@@ -367,7 +330,8 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     except (gym.error.Error, TypeError, ValueError) as error:
         raise ValueError(f"{name}: {env_id} with {kwargs} cannot be made: {error}") from error
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
-    player.check(first)
+    if player.chosen_by[0] == "--policy":
+        actor.check_environment(first, f"policy {name}")  # type: ignore[union-attr]
     start = time.perf_counter()
     with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
         if actor is not None and env_id == SITES:
@@ -385,7 +349,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         env_id=env_id,
         env_kwargs=_without_folders(kwargs),
         seeds=tuple(seeds),
-        command=_with_options(player.command, options),
+        command=_command(player, options),
         wall_time=round(taken, 1),
         date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         physics_version=PHYSICS_VERSION,
@@ -398,7 +362,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     values = {name: figure.value for name, figure in result.figures.items()}
     printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
     figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
-    where = "not written (--results FOLDER or --submit FILE does)" if path is None else f"-> {path}"
+    where = "not written (--results FOLDER does)" if path is None else f"-> {path}"
     _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")
     return result
 
@@ -432,9 +396,6 @@ def _write(result: Result, player: Player, options: ScoringOptions) -> Path | No
 
     agents/results holds the project's own methods on the project's own scenes alone, as `ScoringOptions.standard` says.
     """
-    if options.submit is not None:
-        result.write(options.submit)
-        return options.submit
     if options.results is not None:
         return result.save(options.results)
     own_place = result.env_kwargs.get("scene") in (None, *list_scenes())
@@ -443,82 +404,28 @@ def _write(result: Result, player: Player, options: ScoringOptions) -> Path | No
     return None
 
 
-def print_comparison(one: str, other: str, options: ScoringOptions, console: Console) -> None:
-    """Print the differences of two methods, each a file, a method's name, or a name that training seeds share."""
-    groups = [_group(name, options) for name in (one, other)]
-    names = [Path(name).stem if name.endswith(".json") else name for name in (one, other)]
-    first, differences = groups[0][0], compare(groups[0], groups[1], np.random.default_rng(BOOTSTRAP_SEED))
+def print_comparison(one: Path, other: Path, console: Console) -> None:
+    """Print the differences of the results of two files."""
+    first, second = load_result(one), load_result(other)
     _say(
         console,
         f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap",
     )
-    for name, group in zip(names, groups, strict=True):
-        if len(group) > 1:
-            _say(console, f"{name}: mean over {len(group)} training seeds")
-    for difference in differences:
-        _say(console, describe(difference, *names))
+    for difference in compare(first, second, np.random.default_rng(BOOTSTRAP_SEED)):
+        _say(console, describe(difference, first.method, second.method))
 
 
-def _group(name: str, options: ScoringOptions) -> list[Result]:
-    """The results of a file or of a name: one, or one for each seed of a training."""
-    if name.endswith(".json"):
-        return [load_result(Path(name))]
-    folder = options.results or shipped_results()
-    wanted = _places(options, PLACES)
-    named = [one for one in load_results(folder) if name in (one.method, family(one.method))]
-    # An environment without a choice of scene or level has neither.
-    found = [
-        one
-        for one in named
-        if one.scene in ("", Path(wanted["scene"]).stem)
-        and one.env_kwargs.get("level") in (None, wanted["level"])
-        and one.env_kwargs.get("split") == wanted.get("split")
-        and one.motion == (options.motion or "")
-    ]
-    if not found or len({one.place for one in found}) > 1:
-        places = ", ".join(sorted({one.place for one in named})) or "none"
-        raise ValueError(
-            f"{name!r} names {len(found)} results in {_from_here(folder)} at {wanted['scene']}, {wanted['level']}; it "
-            f"has some at {places}: give --scene, --level and --motion, or a file"
-        )
-    return found
-
-
-def write_reach(options: ScoringOptions, console: Console) -> None:
-    """Press over each lesion of the evaluation seeds, with and without it, and count those below the sensor's reach."""
-    from surgsim_env.palpation.scores import lesion_reaches
-
-    kwargs = _places(options, PLACES)
-    env: Any = gym.make(SITES, **kwargs).unwrapped
-    reaches = []
-    with StepProgress(console) as shown, shown.step("reach", total=len(options.played_seeds)) as ended:
-        for seed in options.played_seeds:
-            env.reset(seed=seed)
-            reaches += lesion_reaches(env.task.anatomy, env.task.drawn)
-            ended(1)
-    table = {
-        **_without_folders(kwargs),
-        "lesions": len(reaches),
-        "below": sum(reach.below for reach in reaches),
-        "noise": env.task.anatomy.scene.sensor.noise,
-        "differences": [round(reach.force - reach.force_without, 5) for reach in reaches],
-    }
-    _say(console, f"{table['below']} of {table['lesions']} lesions below reach")
-    ours = options.standard and kwargs["scene"] in list_scenes() and _checkout() is not None
-    folder = options.results or (shipped_results() if ours else None)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"reach_{place_name(SITES, kwargs)}.json"
-        path.write_text(json.dumps(table) + "\n", encoding="utf-8")
-        _say(console, f"-> {path}")
-
-
-def _with_options(command: str, options: ScoringOptions) -> str:
-    command += "" if options.all_seeds else f" --seeds {seeds_text(options.played_seeds)}"
-    command += "" if options.budget is None else f" --budget {options.budget}"
-    command += "" if options.motion is None else f" --motion {options.motion}"
-    command += " --no-tracking" * options.no_tracking
-    return command + ("" if options.dtype == "float32" else f" --dtype {options.dtype}")
+def _command(player: Player, options: ScoringOptions) -> str:
+    """The command that repeats a result: what is scored, and the options that change its figures."""
+    words = ["surgsim", "evaluate", *player.chosen_by]
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if option.name in ("envs", "threads", "results") or value == option.default:
+            continue
+        words.append(f"--{option.name.replace('_', '-')}")
+        if value is not True:
+            words.append(_from_here(Path(value)) if Path(str(value)).is_absolute() else str(value))
+    return shlex.join(words)
 
 
 def _without_folders(kwargs: dict[str, Any]) -> dict[str, Any]:

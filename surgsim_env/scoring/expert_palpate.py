@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import norm
 from surgsim_env.palpation.chart import MAP_SIDE
 
-ROWS_FEWEST = 5
+# Fewest rows, and largest distance between them [m].
+ROWS_FEWEST, ROW_SPACING = 5, 0.010
+DEPTH = 0.003  # [m] of the tip while it slides
+FORCE_SHARE = 0.75  # of the soft limit, above which the tip lifts
 NEAR = 0.003  # [m] below this distance speed is proportional to it; also the zone at the end of a row
 GOAL_NEAR = 0.006  # [m] the same on the way to the first row and to the stiffest place
 ABOVE = 0.004  # [m] within this of the first row's start the tip descends
@@ -31,16 +34,11 @@ class PalpateExpert:
     first and the last site of the rows show that the search has begun, and that it is over.
     """
 
-    def __init__(
-        self, env: gym.Env, *, depth: float = 0.003, row_spacing: float = 0.010, force_share: float = 0.75
-    ) -> None:
+    def __init__(self, env: gym.Env) -> None:
         """Read the chart, the block's height and the soft limit from an environment.
 
         Args:
             env: with memory=True.
-            depth: of the tip while it slides [m].
-            row_spacing: largest distance between rows [m]; there are at least five rows.
-            force_share: the tip lifts where the force exceeds this share of the soft limit.
 
         Raises:
             ValueError: a scene that is not a block, or an environment without memory.
@@ -54,10 +52,9 @@ class PalpateExpert:
         self.env, self.slices = single, task.observation_slices
         self.chart = task.memory.chart
         self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
-        self.force_most = force_share * scene.limits.soft_force
-        self.depth = depth
+        self.force_most = FORCE_SHARE * scene.limits.soft_force
         # Rows lie on rows of the map's sites, which have visited marks.
-        row_count = max(int(np.ceil(self.chart.extent[1] / row_spacing - 1e-6)) + 1, ROWS_FEWEST)
+        row_count = max(int(np.ceil(self.chart.extent[1] / ROW_SPACING - 1e-6)) + 1, ROWS_FEWEST)
         along, across = task.memory.map.rows_and_columns
         rows = np.unique(np.round(np.linspace(along[0], along[-1], row_count)).astype(int))
         self.rows = self.chart.lower[1] + task.memory.map.axes[1][rows]
@@ -80,7 +77,7 @@ class PalpateExpert:
         sliding = begun & ~over
         across = np.where(sliding[:, None], self._along_rows(tip), gap / GOAL_NEAR)
         # In the air on the way to the first row.
-        wanted = np.where(begun | (distance < ABOVE), self.depth, -TRAVEL_GAP)
+        wanted = np.where(begun | (distance < ABOVE), DEPTH, -TRAVEL_GAP)
         depth = self.surface - height
         rise = np.maximum((depth - wanted) / NEAR, FORCE_GAIN * (force - self.force_most))
         declare = over & (distance < DECLARE_NEAR)

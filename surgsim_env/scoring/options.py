@@ -43,8 +43,6 @@ class ScoringOptions:
     """Of the environment of --agent MODULE:CLASS, as a JSON object."""
     results: Path | None = None
     """Folder of result files; default: agents/results of a checkout."""
-    submit: Path | None = None
-    """Write the result into this file, and nowhere else."""
 
     def __post_init__(self) -> None:
         if self.split is not None and self.split not in SPLITS:
@@ -55,7 +53,7 @@ class ScoringOptions:
         given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)
         if self.episodes is not None and not 1 <= self.episodes <= len(given):
             raise ValueError(f"--episodes is {self.episodes}; there are 1 to {len(given)} seeds")
-        if not isinstance(self.env_arguments, str) or not isinstance(_json(self.env_arguments), dict):
+        if not isinstance(self.env_kwargs, dict):
             raise ValueError(f"--env-arguments is {self.env_arguments!r}; it must be a JSON object")
 
     @cached_property
@@ -65,23 +63,12 @@ class ScoringOptions:
         return tuple(given)[: self.episodes]
 
     @property
-    def all_seeds(self) -> bool:
-        """Whether all evaluation seeds are played, and no others."""
-        return self.played_seeds == tuple(EVALUATION_SEEDS)
-
-    @property
     def standard(self) -> bool:
         """Whether results are those that are shipped: of all evaluation seeds, presses and lanes as by default."""
-        return self.all_seeds and self.budget is None and self.dtype == type(self).dtype
+        all_seeds = self.played_seeds == tuple(EVALUATION_SEEDS)
+        return all_seeds and self.budget is None and self.dtype == type(self).dtype
 
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:
         """`env_arguments` as a dictionary."""
-        return _json(self.env_arguments)
-
-
-def _json(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return None
+        return json.loads(self.env_arguments)

@@ -15,8 +15,6 @@ from surgsim_env.scene.motions import STILL
 # JSON has no infinity.
 NEVER = "never"
 SITES = "SurgSim/PalpateSites-v0"
-# Most seeds of a range that a user writes.
-SEEDS_MOST = 100_000
 
 
 @dataclass(frozen=True)
@@ -58,27 +56,26 @@ class Result:
 
     @property
     def place(self) -> str:
-        """The key that groups tables (`place_name`)."""
-        return place_name(self.env_id, self.env_kwargs)
+        """The key that groups tables: environment, scene, level, a split other than "test" and motion."""
+        level, split = self.env_kwargs.get("level") or "", self.env_kwargs.get("split") or ""
+        name = self.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+        parts = [name, self.scene, level, "" if split == "test" else split, self.motion]
+        return "_".join(part for part in parts if part)
 
     @property
     def scene(self) -> str:
         """Name of the scene, also where it was given as a file; "" for the environment's own."""
-        return _scene_name(self.env_kwargs)
+        return Path(self.env_kwargs.get("scene") or "").stem
 
     @property
     def motion(self) -> str:
         """How the patient moves; "" for one who holds still."""
-        return _motion_name(self.env_kwargs)
+        motion = self.env_kwargs.get("motion") or STILL
+        return "" if motion == STILL else motion
 
     def save(self, folder: Path) -> Path:
         """Write it into a folder; replaces an older result of the same method and place."""
         path = folder / f"{self.place}_{self.method}.json"
-        self.write(path)
-        return path
-
-    def write(self, path: Path) -> None:
-        """Write it as a file."""
         table = asdict(self)
         table["seeds"] = seeds_text(self.seeds)
         table["figures"] = {
@@ -87,23 +84,7 @@ class Result:
         path.parent.mkdir(parents=True, exist_ok=True)
         lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
         path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-
-
-def place_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
-    """Environment, scene, level, a split other than "test" and motion, as a part of file names."""
-    parts = [env_id.removeprefix("SurgSim/").removesuffix("-v0"), _scene_name(env_kwargs)]
-    split = env_kwargs.get("split") or ""
-    parts += [env_kwargs.get("level") or "", "" if split == "test" else split, _motion_name(env_kwargs)]
-    return "_".join(part for part in parts if part)
-
-
-def _scene_name(env_kwargs: dict[str, Any]) -> str:
-    return Path(env_kwargs.get("scene") or "").stem
-
-
-def _motion_name(env_kwargs: dict[str, Any]) -> str:
-    motion = env_kwargs.get("motion") or STILL
-    return "" if motion == STILL else motion
+        return path
 
 
 def shipped_results() -> Path:
@@ -112,7 +93,7 @@ def shipped_results() -> Path:
 
 
 def load_result(path: Path) -> Result:
-    """Read a file of `Result.write`.
+    """Read a file of `Result.save`.
 
     Raises:
         ValueError: another content (names the file and what is wrong).
@@ -124,32 +105,21 @@ def load_result(path: Path) -> Result:
             for name, values in table["figures"].items()
         }
         return Result(**{**table, "seeds": read_seeds(table["seeds"])})
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         said = " ".join(str(error).split())[:200]
         raise ValueError(f"{path} is no result of surgsim evaluate: {type(error).__name__}: {said}") from None
 
 
 def load_results(folder: Path) -> list[Result]:
-    """All results of a folder, by file name, without `reach_*.json`."""
-    return [load_result(path) for path in sorted(folder.glob("*.json")) if not path.name.startswith("reach_")]
-
-
-def picture_name(result: Result) -> str:
-    """File name of the leaderboard's picture of a result's environment and scene."""
-    env_name = result.env_id.removeprefix("SurgSim/").removesuffix("-v0")
-    return "_".join(part for part in ("leaderboard", env_name, result.scene) if part) + ".png"
-
-
-def family(method: str) -> str:
-    """The name that policies of one configuration and several training seeds share: mine of mine_seed3."""
-    return re.sub(r"_seed\d+(?=_untracked$|$)", "", method)
+    """All results of a folder, by file name."""
+    return [load_result(path) for path in sorted(folder.glob("*.json"))]
 
 
 def read_seeds(text: str) -> tuple[int, ...]:
     """The seeds of "FIRST:LAST", both included, or of a list "A,B,C".
 
     Raises:
-        ValueError: another text, a negative seed, one twice, or more than SEEDS_MOST.
+        ValueError: another text, or a negative seed.
     """
     rule = (
         f"seeds are {text!r:.60}; the rule is FIRST:LAST, both included, or a list A,B,C of whole numbers, at least 0"
@@ -158,14 +128,10 @@ def read_seeds(text: str) -> tuple[int, ...]:
         raise ValueError(rule)
     if ":" in text:
         first, last = map(int, text.split(":"))
-        if not 0 <= last - first < SEEDS_MOST:
-            raise ValueError(f"{rule}; FIRST is at most LAST, with at most {SEEDS_MOST} seeds")
+        if first > last:
+            raise ValueError(f"{rule}; FIRST is at most LAST")
         return tuple(range(first, last + 1))
-    seeds = tuple(map(int, text.split(",")))
-    twice = next((seed for place, seed in enumerate(seeds) if seed in seeds[:place]), None)
-    if twice is not None:
-        raise ValueError(f"{rule}; {twice} is there twice")
-    return seeds
+    return tuple(map(int, text.split(",")))
 
 
 def seeds_text(seeds: Sequence[int]) -> str:

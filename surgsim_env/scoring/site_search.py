@@ -43,8 +43,6 @@ class RasterSites:
     """
 
     def __init__(self, side: int) -> None:
-        if side < 1:
-            raise ValueError(f"side is {side}; a raster has at least 1 place a side")
         middles, corners = (np.arange(side) + 0.5) / side, np.arange(side + 1) / side
         self.actions = 2.0 * np.concatenate([_there_and_back(middles), _there_and_back(corners)]) - 1.0
 

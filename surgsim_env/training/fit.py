@@ -36,12 +36,7 @@ def fit(
 
     Returns:
         The mean loss of the last tenth of the updates.
-
-    Raises:
-        ValueError: a number of the targets that is not finite.
     """
-    if not np.isfinite(targets).all():
-        raise ValueError(f"targets hold {targets[~np.isfinite(targets)][0]}; every number must be finite")
     weights = np.broadcast_to(np.asarray(weight, dtype=np.float32), targets.shape)
     rng, order, losses = np.random.default_rng(seed), np.zeros(0, dtype=np.int64), []
     parameters = list(network.parameters())

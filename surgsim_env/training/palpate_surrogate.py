@@ -5,12 +5,11 @@ Agents are scored on the full physics only. The force of a press at x, y and dep
     F = c (d / 1 m)^p (1 + A exp(-r^2 / (2 s^2))) e(x, y)
 
 with r the distance from the lesion's place, and e the fall towards the block's edges. The numbers are fitted to presses
-of the full physics (`TOUCH`); sensor, limits, rewards, memory and episode are the environment's own. All environments
+of the full physics; sensor, limits, rewards, memory and episode are the environment's own. All environments
 are stepped together.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -31,32 +30,13 @@ from surgsim_env.tasks.palpate import (
 )
 from surgsim_env.tasks.task import SPEED_FULL_SCALE
 
-
-@dataclass(frozen=True)
-class TouchModel:
-    """Force model of a block, fitted to the full physics at level "standard".
-
-    Args:
-        stiffness: c [N], the force of healthy tissue in the middle, extrapolated to a depth of 1 m.
-        exponent: p.
-        edge: e = 1 - edge (x/a)^edge_power - edge (y/a)^edge_power, x and y from the middle, a half the block's side.
-        edge_power: see edge.
-        excess: range of A.
-        width: range of s [m].
-        friction: tangential over normal force of a sliding tip.
-    """
-
-    stiffness: float
-    exponent: float
-    edge: float
-    edge_power: float
-    excess: tuple[float, float]
-    width: tuple[float, float]
-    friction: float
-
-
 SCENE = "phantom_small"
-TOUCH = TouchModel(587.0, 1.42, 0.315, 3.06, (0.13, 0.50), (0.0045, 0.0066), 0.2)
+# The formula's numbers, fitted to the full physics at level "standard": c [N], p, the ranges of A and s [m], and of
+# e = 1 - EDGE (x/a)^EDGE_POWER - EDGE (y/a)^EDGE_POWER, x and y from the middle, a half the block's side.
+STIFFNESS, EXPONENT, EXCESS, WIDTH = 587.0, 1.42, (0.13, 0.50), (0.0045, 0.0066)
+EDGE, EDGE_POWER = 0.315, 3.06
+# Tangential over normal force of a sliding tip.
+FRICTION = 0.2
 
 
 class PalpateSurrogate(VectorEnv):
@@ -126,20 +106,20 @@ class PalpateSurrogate(VectorEnv):
 
     def normal_force(self) -> NDArray[np.float64]:
         """Force along the normal [N] (n_env,): the formula above."""
-        touch, depth = TOUCH, np.maximum(self.surface - self.tip[:, 2], 0.0)
+        depth = np.maximum(self.surface - self.tip[:, 2], 0.0)
         off = np.abs(self.tip[:, :2] / (0.5 * self.block[:2]) - 1.0)
-        edge = np.maximum(1.0 - touch.edge * (off**touch.edge_power).sum(axis=1), 0.3)
+        edge = np.maximum(1.0 - EDGE * (off**EDGE_POWER).sum(axis=1), 0.3)
         gap = ((self.tip[:, :2] - self.lesion) ** 2).sum(axis=1)
         bump = 1.0 + self.excess * np.exp(-0.5 * gap / self.width**2)
-        return touch.stiffness * depth**touch.exponent * bump * edge
+        return STIFFNESS * depth**EXPONENT * bump * edge
 
     def _draw(self, which: NDArray[np.bool_]) -> None:
         """Draw new episodes: lesion, sensor bias, start."""
         count, rng, scene = int(which.sum()), self.rng, self.scene
         rim, margin = scene.lesion.rim_distance, scene.palpation.face_margin
         self.lesion[which] = rng.uniform(rim, self.block[:2] - rim, (count, 2))
-        self.excess[which] = rng.uniform(*TOUCH.excess, count)
-        self.width[which] = rng.uniform(*TOUCH.width, count)
+        self.excess[which] = rng.uniform(*EXCESS, count)
+        self.width[which] = rng.uniform(*WIDTH, count)
         self.bias[which] = rng.uniform(-scene.sensor.bias, scene.sensor.bias, (count, 3))
         place = rng.uniform(margin, self.block[:2] - margin, (count, 2))
         height = self.surface + rng.uniform(*START_GAP, count)
@@ -153,7 +133,7 @@ class PalpateSurrogate(VectorEnv):
         normal = self.normal_force()
         speed = np.linalg.norm(self.velocity[:, :2], axis=1, keepdims=True)
         way = self.velocity[:, :2] / np.maximum(speed, 1e-9)
-        force = np.column_stack([-TOUCH.friction * normal[:, None] * way, normal]) + self.bias
+        force = np.column_stack([-FRICTION * normal[:, None] * way, normal]) + self.bias
         reach = self.scene.sensor.range
         reading = np.clip(force + self.rng.normal(0.0, self.scene.sensor.noise, force.shape), -reach, reach)
         left = 1.0 - self.steps / EPISODE_STEPS

@@ -6,10 +6,9 @@ Reading the files runs no code of theirs.
 
 import argparse
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from surgsim_env.envs.ids import TASKS
-from surgsim_env.scene.load import fill_json
+from surgsim_env.scene.load import fill
 from surgsim_env.tasks.task import Task
 from surgsim_env.training.acquisition import Acquisition
 from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
@@ -39,9 +38,6 @@ class PolicyDescription:
         network: of NAME.safetensors; None for an acquisition function
         acquisition: its numbers; None for a network
         trained_steps, seed: of its training
-
-    Raises:
-        ValueError: an action_repeat below 1.
     """
 
     env_id: str
@@ -52,10 +48,6 @@ class PolicyDescription:
     acquisition: tuple[float, ...] | None = None
     trained_steps: int = 0
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.action_repeat < 1:
-            raise ValueError(f"action_repeat is {self.action_repeat}; it must be at least 1")
 
     @property
     def plays_every_scene(self) -> bool:
@@ -90,14 +82,6 @@ def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
     }
 
 
-class Decider(Protocol):
-    """What a policy decides by: a `PolicyNetwork` or an `Acquisition`."""
-
-    def actions(self, observations: Any, generators: Sequence[torch.Generator]) -> NDArray[np.float32]:
-        """Actions (n, n_action) in [-1, 1] for observations of n environments, each with its random numbers."""
-        ...
-
-
 class TrainedPolicy:
     """A policy with its action repeat; `act` is called each control step.
 
@@ -109,7 +93,7 @@ class TrainedPolicy:
     episode's own random numbers, whatever is played beside it.
     """
 
-    def __init__(self, decider: Decider, description: PolicyDescription) -> None:
+    def __init__(self, decider: PolicyNetwork | Acquisition, description: PolicyDescription) -> None:
         self.decider = decider
         self.description = description
         self.reset(1)
@@ -209,7 +193,7 @@ def load_policy(path: Path) -> TrainedPolicy:
     file = path.with_suffix(".safetensors")
     try:
         return TrainedPolicy(_filled(description.network, safetensors.torch.load(file.read_bytes())), description)
-    except (OSError, safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
+    except (OSError, safetensors.SafetensorError, KeyError, IndexError, RuntimeError) as error:
         raise ValueError(f"policy {file}: {' '.join(str(error).split())[:300]}") from None
 
 
@@ -217,25 +201,20 @@ def read_description(path: Path) -> PolicyDescription:
     """The description in NAME.json, the path of a policy's either file.
 
     Raises:
-        ValueError: no such file, a file that is no JSON table, or an entry that is unknown, missing or wrong.
+        ValueError: no such file, a file that is no JSON, or an entry that is unknown, missing or wrong.
     """
     document = path.with_suffix(".json")
     try:
-        text = document.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        table = json.loads(document.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise ValueError(f"policy {document} cannot be read: {error}") from None
-    return fill_json(PolicyDescription, text, f"policy {document}")
+    return fill(PolicyDescription, table, f"policy {document}")
 
 
 def _filled(layout: NetworkLayout, weights: dict[str, torch.Tensor]) -> PolicyNetwork:
     """A network with these weights, whose shapes are the sizes of its layers."""
     numbers = sorted(int(name.split(".")[1]) for name in weights if name.startswith("layers.") and "weight" in name)
     layers = [weights[f"layers.{number}.weight"] for number in numbers]
-    if not layers or any(one.ndim != 2 for one in layers):
-        raise ValueError("the rule is weights layers.0.weight, layers.2.weight, ... of two dimensions")
-    for name, values in weights.items():
-        if not bool(torch.isfinite(values).all()):
-            raise ValueError(f"tensor {name} holds numbers that are not finite")
     sizes = [layers[0].shape[1], *(one.shape[0] for one in layers)]
     network = PolicyNetwork(layout, sizes, normalised="mean" in weights, drawn="log_spread" in weights)
     network.load_state_dict(weights)

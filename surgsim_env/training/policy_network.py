@@ -32,19 +32,10 @@ class NetworkLayout:
     Args:
         activation: between the layers, a name of ACTIVATIONS.
         features: that the layers read, a name of FEATURES; the observation itself if None.
-
-    Raises:
-        ValueError: an unknown name (lists the known).
     """
 
     activation: str = "tanh"
     features: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f"activation is {self.activation!r}; known are {', '.join(ACTIVATIONS)}")
-        if self.features is not None and self.features not in FEATURES:
-            raise ValueError(f"features is {self.features!r}; known are {', '.join(FEATURES)}, or null")
 
 
 class PolicyNetwork(nn.Module):
@@ -60,16 +51,10 @@ class PolicyNetwork(nn.Module):
             sizes: of what the layers read, of each hidden layer and of the action.
             normalised: observations are normalised first (`normalise_by`).
             drawn: actions are drawn around their mean, with standard deviations exp(`log_spread`).
-
-        Raises:
-            ValueError: features of another size than `sizes` begins with.
         """
         super().__init__()
         self.layout = layout
         self.features = nn.Identity() if layout.features is None else FEATURES[layout.features]()
-        read = getattr(self.features, "features_dim", sizes[0])
-        if read != sizes[0]:
-            raise ValueError(f"the first layer reads {sizes[0]} numbers; {layout.features} gives {read}")
         parts: list[nn.Module] = []
         for inputs, outputs in pairwise(sizes):
             parts += [nn.Linear(inputs, outputs), ACTIVATIONS[layout.activation]()]

@@ -5,7 +5,6 @@ and column of their touch maps (`agents/record_faces.py`); between these sites c
 computed on the environment itself, never on a recording.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
@@ -21,8 +20,6 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap, interpolated
 from surgsim_env.palpation.lesion_estimator import LESIONS_MOST, ORGAN_MAP_SPREAD, LesionEstimator
-from surgsim_env.scene.family import DEFAULT_SPLIT
-from surgsim_env.scene.load import make_scene
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.training.site_surrogate import SurrogateFace
 
@@ -43,7 +40,6 @@ class RecordedFaces:
     """Faces of organs; called with a generator, it draws one of them.
 
     Fields:
-        scene, split, level: of the organs; split "" for a scene without a family
         extent: of the charts [m]                                                               (n_face, 2)
         cell: of the touch maps [m]                                                             (n_face,)
         pressable: sites of the touch maps that may be pressed                                  (n_face, n n)
@@ -54,9 +50,6 @@ class RecordedFaces:
         noise, map_spread: of the estimator                                                     (n_face,)
     """
 
-    scene: str
-    split: str
-    level: str
     extent: FloatArray
     cell: FloatArray
     pressable: NDArray[np.bool_]
@@ -98,13 +91,11 @@ class RecordedFaces:
         )
 
     def save(self, path: Path) -> None:
-        """Write the recording atomically, numbers in single precision."""
+        """Write the recording, numbers in single precision."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.npz")
         values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
         single = {name: one.astype(np.float32) if one.dtype == np.float64 else one for name, one in values.items()}
-        np.savez_compressed(part, **single)
-        os.replace(part, path)
+        np.savez_compressed(path, **single)
 
 
 def _on_surface(surface: FloatArray, extent: FloatArray, points: FloatArray) -> FloatArray:
@@ -113,77 +104,45 @@ def _on_surface(surface: FloatArray, extent: FloatArray, points: FloatArray) -> 
 
 
 def load_faces(path: str | Path) -> RecordedFaces:
-    """Read a recording.
-
-    Raises:
-        ValueError: a file that is not a recording.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            kept = {field.name: file[field.name] for field in fields(RecordedFaces)}
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(
-            f"{path} is not a recording of faces ({error}): make one with python -m agents.record_faces"
-        ) from None
-    return RecordedFaces(**{name: _as_used(value) for name, value in kept.items()})
-
-
-def _as_used(value: NDArray[Any]) -> Any:
-    """A text, or an array of what the faces compute with."""
-    if value.ndim == 0:
-        return str(value)
-    return value.astype(np.float64) if value.dtype == np.float32 else value
+    """Read a recording of `agents.record_faces`."""
+    with np.load(path, allow_pickle=False) as file:
+        kept = {field.name: file[field.name] for field in fields(RecordedFaces)}
+    return RecordedFaces(
+        **{name: value.astype(np.float64) if value.dtype == np.float32 else value for name, value in kept.items()}
+    )
 
 
 # ---- recording -------------------------------------------------------------------------------------------------------
 
 
 def record_faces(
-    path: Path,
-    scene: str,
-    split: str | None,
-    level: str,
-    count: int,
-    progress: Callable[[int], object] = lambda done: None,
+    scene: str, split: str | None, level: str, count: int, progress: Callable[[int], object] = lambda done: None
 ) -> RecordedFaces:
-    """Record until a file has `count` faces at least, in batches of LANES; each is saved when it is complete.
+    """Record `count` faces at least, in batches of LANES.
 
     Args:
-        path: of the file; one that exists is continued.
         scene: by name or path.
-        split: of a family, DEFAULT_SPLIT if None.
+        split: of a family; the environment's own if None.
         level: what an episode draws.
         count: of faces.
         progress: called with the number of faces after each batch.
 
     Raises:
-        ValueError: the file is of another scene, split or level; a split for a scene without a family.
+        ValueError: a split for a scene without a family.
         RuntimeError: a press ended its episode, by a fault or the hard limit (names the seed and the site).
     """
-    recorded = load_faces(path) if path.exists() else None
-    split = split or (DEFAULT_SPLIT if make_scene(scene).family is not None else "")
-    if recorded is not None and (recorded.scene, recorded.split, recorded.level) != (scene, split, level):
-        raise ValueError(
-            f"{path} holds faces of scene {recorded.scene!r}, split {recorded.split!r}, level {recorded.level!r}, not "
-            f"of {scene!r}, {split!r}, {level!r}: give another --out"
-        )
     # The budget ends no episode before all sites were pressed.
     settings: dict[str, Any] = {"scene": scene, "level": level, "budget": MAP_SIDE**2}
     envs = gym.make_vec(
         "SurgSim/PalpateSites-v0", num_envs=LANES, vectorization_mode="vector_entry_point", autoreset_mode="Disabled",
         dtype="float32", **(settings | ({"split": split} if split else {})),
     )  # fmt: skip
-    while recorded is None or len(recorded) < count:
-        done = 0 if recorded is None else len(recorded)
-        batch = _record_batch(envs, [FIRST_SEED + done + lane for lane in range(LANES)])
-        stacked = {name: np.stack([one[name] for one in batch]) for name in batch[0]}
-        if recorded is not None:
-            stacked = {name: np.concatenate([getattr(recorded, name), values]) for name, values in stacked.items()}
-        RecordedFaces(scene, split, level, **stacked).save(path)
-        recorded = load_faces(path)
-        progress(len(recorded))
+    faces: list[dict[str, Any]] = []
+    while len(faces) < count:
+        faces += _record_batch(envs, [FIRST_SEED + len(faces) + lane for lane in range(LANES)])
+        progress(len(faces))
     envs.close()
-    return recorded
+    return RecordedFaces(**{name: np.stack([one[name] for one in faces]) for name in faces[0]})
 
 
 def _record_batch(envs: gym.vector.VectorEnv, seeds: list[int]) -> list[dict[str, Any]]:

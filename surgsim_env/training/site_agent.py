@@ -80,17 +80,7 @@ def remembered(observation: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDA
 
 
 def observed_facts(observation: NDArray[np.floating]) -> SiteFacts:
-    """The facts that an observation with memory holds, lengths in tip radii.
-
-    Raises:
-        ValueError: lengths that are not above 0, which no environment observes (names the channel).
-    """
-    for name in ("map_cell", "chart_share", "lesion_radius"):
-        if not (np.asarray(observation[SLICES[name]]) > 0.0).all():
-            raise ValueError(
-                f"observation: {name} is {observation[SLICES[name]].tolist()}; it must be above 0, as "
-                "SurgSim/PalpateSites-v0 observes it with memory=True"
-            )
+    """The facts that an observation with memory holds, lengths in tip radii."""
     cell, share, noise, least, radius = (np.asarray(observation[SLICES[name]], dtype=np.float64) for name in FACTS)
     face = np.asarray(observation[SLICES["face_map"]]) > 0.5
     observed_map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)

@@ -81,11 +81,6 @@ def test_belief_is_that_of_scikit_learn():
     np.testing.assert_allclose(belief.spread[inside], expected[inside], atol=1e-8)
 
 
-def test_an_observation_without_a_map_is_refused():
-    with pytest.raises(ValueError, match=r"map_cell is .* must be above 0"):
-        Acquisition().actions(np.zeros((1, OBSERVATION_SIZE), dtype=np.float32))
-
-
 def test_the_acquisition_function_is_its_formula():
     """Against plain sums over all sites, for numbers at which every term counts."""
     values = (2.0, 1.5, 0.7, 0.4, -0.5, 0.25, 1.3, 0.9, 1.2, 0.5, 0.2, 1.1, 0.5)

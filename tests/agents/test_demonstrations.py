@@ -258,53 +258,9 @@ def test_a_class_that_is_no_agent_is_refused():
         player(f"{__name__}:OfEnvironment", env, {})
 
 
-def test_a_name_that_minari_refuses_is_refused_before_anything_is_played(folder, dataset, monkeypatch):
+def test_a_name_that_is_taken_is_refused_before_anything_is_played(folder, dataset, monkeypatch):
     from agents import record_demonstrations
 
     monkeypatch.setattr(record_demonstrations, "record", None)
-    for name, said in (
-        *((name, f"--dataset is '{name}'; the rule of Minari is NAME-v") for name in ("palpate", "a b-v0", "x/y-v0")),
-        (NAME, f"--dataset {NAME} is there already"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            record_demonstrations.main(["SurgSim/Palpate-v0", "--dataset", name])
-
-
-class Shown(gym.Env):
-    """As much of an environment in a window as the keyboard asks for."""
-
-    render_mode = "human"
-
-    class task:
-        pass
-
-    class window:
-        closed = False
-
-        @classmethod
-        def held_keys(cls):
-            return "F"
-
-    def __init__(self, size, jaw=False):
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (size,), dtype=np.float32)
-        if jaw:
-            self.task = type("task", (), {"jaw_place": size - 1})
-
-
-def test_a_person_plays_with_the_keys_that_are_held():
-    from agents.keyboard import Keyboard
-
-    env = Shown(4)
-    keyboard = Keyboard(env)
-    np.testing.assert_array_equal(keyboard(None, None), [[0.0, 0.0, -0.5, 0.0]])
-    np.testing.assert_array_equal(keyboard.action("DWE "), [0.5, 0.5, 0.0, 1.0], "no wrist to turn; declared")
-    retracting = Keyboard(Shown(5, jaw=True))
-    np.testing.assert_array_equal(retracting.action("AQ"), [-0.5, 0.0, 0.0, -0.5, 1.0], "the jaw is open")
-    np.testing.assert_array_equal(retracting.action("RF "), [0.0, 0.0, 0.0, 0.0, -1.0])
-    env.window.closed = True
-    with pytest.raises(KeyboardInterrupt, match="the window was closed"):
-        keyboard(None, None)
-    with pytest.raises(ValueError, match="render_mode is None; a person needs the window"):
-        Keyboard(gym.make("SurgSim/Palpate-v0"))
-    with pytest.raises(ValueError, match="the keys move one tip"):
-        Keyboard(Shown(13, jaw=True))
+    with pytest.raises(ValueError, match=f"--dataset {NAME} is there already"):
+        record_demonstrations.main(["SurgSim/Palpate-v0", "--dataset", NAME])

@@ -44,8 +44,3 @@ def test_what_is_scarce_can_be_weighted():
     fit(network, observations, actions, updates=400, weight=weight)
     # (9 x 100 x 0.8) / (9 x 100 + 300) = 0.6, and 0.8 / 4 = 0.2.
     assert network.actions(observations[:1], ())[0] == pytest.approx([0.6, 0.2], abs=0.06)
-
-
-def test_targets_that_are_not_finite_are_refused():
-    with pytest.raises(ValueError, match="targets hold nan"):
-        fit(made(normalised=False), np.zeros((9, 3), np.float32), np.full((9, 2), np.nan), updates=1)

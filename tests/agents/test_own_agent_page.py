@@ -16,6 +16,8 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "own_agent.md"
 
 def shorter(arguments: list[str]) -> list[str]:
     """Two organs and three presses, on a small scene, in place of a whole evaluation."""
+    if "--compare" in arguments:
+        return ["--compare", *sorted(map(str, Path("scores").iterdir()))]
     if "--agent" not in arguments:
         return arguments
     if "--env" in arguments:
@@ -38,5 +40,5 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
     sys.modules.pop("my_agent", None)
     printed = capsys.readouterr().out
     assert commands == 5
-    assert "presses to 5 mm: spread " in printed
-    assert load_result(Path("descend.json")).env_id == "SurgSim/Palpate-v0"
+    assert "presses to 5 mm: my_agent.Spread " in printed
+    assert load_result(Path("scores/Palpate_phantom_small_my_agent.Descend.json")).env_id == "SurgSim/Palpate-v0"

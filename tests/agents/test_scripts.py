@@ -18,10 +18,8 @@ ELSEWHERE = {
     "learn_retract": "test_retract_agents.py",
     "learn_sites": "test_learn_sites.py",
     "leaderboard": "test_evaluate.py",
-    "raster": "test_agents.py",
     "record_demonstrations": "test_demonstrations.py",
     "record_faces": "test_recorded_faces.py",
-    "train_rllib": "test_rllib.py",
 }
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
-from surgsim_env.scoring.evaluate import find_agent
 from surgsim_env.scoring.site_search import AGENTS, BOUNDS
 from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
 
@@ -49,7 +48,7 @@ class Chart:
 
 
 def played(name: str, chart: Chart, presses: int = 25, seed: int = 0) -> np.ndarray:
-    agent = find_agent(name)()
+    agent = AGENTS[name]()
     agent.reset(np.random.default_rng(seed), FACTS)
     for _ in range(presses):
         chart.press(agent.act(chart.observation()))
@@ -105,7 +104,7 @@ def test_variance_reduction_fills_the_chart() -> None:
 
 
 def test_the_oracle_presses_lesions_last() -> None:
-    agent = find_agent("oracle")()
+    agent = AGENTS["oracle"]()
     agent.reset(np.random.default_rng(0), FACTS)
     truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
     chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
@@ -118,7 +117,7 @@ def test_the_oracle_presses_lesions_last() -> None:
 
 
 def test_the_near_oracle_presses_lesions_first() -> None:
-    agent = find_agent("oracle_near")()
+    agent = AGENTS["oracle_near"]()
     agent.reset(np.random.default_rng(0), FACTS)
     truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
     chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
@@ -131,8 +130,3 @@ def test_the_near_oracle_presses_lesions_first() -> None:
     away = np.linalg.norm(places[2:, None] - truth[:, :2], axis=2).min(axis=1)
     assert away[0] > 0.015
     np.testing.assert_allclose(away[1:], 0.9 * FACTS.lesion_radius, rtol=0.01)
-
-
-def test_unknown_agents_are_refused() -> None:
-    with pytest.raises(ValueError, match="agent 'gp_ubc' is unknown"):
-        find_agent("gp_ubc")

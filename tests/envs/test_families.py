@@ -132,7 +132,7 @@ def test_side_by_side_equals_one_after_the_other(blocks, env_id, settings):
 def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(blocks, tmp_path, monkeypatch):
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     pressed = []
-    member_map._maps.clear()
+    member_map.member_map.cache_clear()
 
     def press_sites(anatomy, sites, progress, dtype=None, name=""):
         """Twice as stiff as the template, everywhere."""
@@ -148,10 +148,10 @@ def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(bloc
     count = member_map.PRESS_COUNT
     assert pressed == [("test 0", count, "test 0"), ("test 1", count, "test 1")]
     assert len(list((tmp_path / "cache").iterdir())) == 2
-    member_map._maps.clear()
+    member_map.member_map.cache_clear()
     member_map.member_map(template, MemberName("test", 0))
     assert len(pressed) == 2, "it is read from the cache"
-    member_map._maps.clear()
+    member_map.member_map.cache_clear()
 
 
 def test_healthy_members_have_contrast_one(blocks):

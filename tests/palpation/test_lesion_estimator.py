@@ -110,9 +110,3 @@ def test_a_map_that_deviates_asks_for_more_excess() -> None:
     assert doubtful.excess_least == pytest.approx(estimator().excess_least + module.EXCESS_LEAST_MAP * 0.05)
     assert estimator().excess_least < plain.strength[0] < doubtful.excess_least
     assert len(doubtful.estimate(places, values).points) == 0
-
-
-@pytest.mark.parametrize("arguments", [{"extent": (0.04, 0.0)}, {"lesion_radius": 0.0}, {"noise": -0.1}])
-def test_refusals_at_construction(arguments: dict) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(arguments))} is"):
-        LesionEstimator(**({"extent": EXTENT, "lesion_radius": LESION_RADIUS, "noise": NOISE} | arguments))

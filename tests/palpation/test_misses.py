@@ -16,7 +16,6 @@ from surgsim_env.palpation.misses import (
     NOISE,
     NOT_FACED,
     TOO_DEEP,
-    PressedSites,
     explain_misses,
 )
 from surgsim_env.palpation.truth import seen_from_surface
@@ -33,7 +32,7 @@ ANATOMY = anatomy_of(
             Anchor("floor", box=Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-6))),
             Anchor("clamp", ball=Ball((0.08, 0.04, 0.05), 0.012)),
         ),
-        palpation=replace(PHANTOM.palpation, face_margin=0.008),
+        palpation=replace(PHANTOM.palpation, face_margin=0.008, site_spacing=SPACING),
         sensor=replace(PHANTOM.sensor, noise=0.01),
     ),
     box_mesh((0.10, 0.08, 0.05), (10, 8, 5)),
@@ -57,8 +56,7 @@ def missed(monkeypatch, *lesions, forces=(0.30, 0.20), estimates=(), sites=SITES
     truths = seen_from_surface(lesions, ANATOMY)
     found = [Estimate(np.array(place), 1.5, 0.5) for place in estimates]
     one = score_map("m", sites, np.ones(len(sites)), found, truths, ANATOMY.along_surface, spacing=SPACING)
-    pressed = PressedSites(sites, early, SPACING)
-    return explain_misses(ANATOMY, ANATOMY.organ(lesions), lesions, truths, (one,), pressed)
+    return explain_misses(ANATOMY, ANATOMY.organ(lesions), lesions, truths, (one,), sites, early)
 
 
 def test_a_lesion_that_is_felt_needs_no_reason(monkeypatch):

@@ -104,10 +104,6 @@ def test_an_episode_that_ended_early_keeps_its_last_error() -> None:
     truth = places(np.random.default_rng(2), 1)
     errors = press_errors(record(truth, [NONE, truth + np.array([0.003, 0.0, 0.0])]), BUDGET)
     np.testing.assert_allclose(errors, [CUTOFF, 0.003, 0.003, 0.003, 0.003])
-    with pytest.raises(ValueError, match="0 estimates in an episode of 5 presses"):
-        press_errors(record(truth, []), BUDGET)
-    with pytest.raises(ValueError, match="6 estimates in an episode of 5 presses"):
-        press_errors(record(truth, [truth] * 6), BUDGET)
 
 
 def test_missed_and_imagined_lesions_count() -> None:

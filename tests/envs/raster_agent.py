@@ -1,21 +1,15 @@
 """A scripted agent for SurgSim/Palpate-v0: press a raster, go back to the stiffest place, declare it.
 
 It uses the observation (tip position, force) and the scene file (height of the phantom, force limits) only, so a
-learning agent should beat its score. Run it, or score it, from a checkout:
-
-    python -m agents.raster --episodes 5
-    surgsim evaluate --agent agents.raster:RasterAgent --env SurgSim/Palpate-v0 --scene phantom --seeds 0:4
+learning agent should beat its score.
 """
 
-import argparse
 from collections.abc import Iterator
 
 import gymnasium as gym
 import numpy as np
 
-import surgsim_env  # noqa: F401  (registers the ids)
-from agents.command_line import one_line_errors
-from surgsim_env.scoring.episodes import EpisodeFacts, agent_generator, episode_facts
+from surgsim_env.scoring.episodes import EpisodeFacts
 
 PRESS_DEPTH = 0.0035  # [m] below the resting surface
 TRAVEL_GAP = 0.0006  # [m] between tip and surface while moving sideways
@@ -83,36 +77,3 @@ class RasterAgent:
         excess = np.maximum(forces - np.median(forces), 0.0)
         near = np.linalg.norm(sites - best, axis=1) < 0.014
         return (excess[near, None] * sites[near]).sum(axis=0) / excess[near].sum()
-
-
-def run_episode(env: gym.Env, agent: RasterAgent, seed: int) -> dict:
-    """Play one episode; returns its last info with return and number of steps."""
-    observation, info = env.reset(seed=seed)
-    assert env.spec is not None
-    agent.reset(agent_generator(seed), episode_facts(env, env.spec.id, env.spec.kwargs))
-    total, steps, over = 0.0, 0, False
-    while not over:
-        observation, reward, terminated, truncated, info = env.step(agent.act(observation))
-        total, steps, over = total + reward, steps + 1, terminated or truncated
-    return {**info, "return": total, "steps": steps}
-
-
-def main() -> None:
-    """Print one line per episode."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=5)
-    parser.add_argument("--scene", default="phantom")
-    arguments = parser.parse_args()
-    env = gym.make("SurgSim/Palpate-v0", scene=arguments.scene)
-    agent = RasterAgent()
-    for seed in range(arguments.episodes):
-        record = run_episode(env, agent, seed)
-        print(
-            f"seed {seed}: success {record['success']}, error {record['error_mm']:.1f} mm, "
-            f"{record['steps']} steps, return {record['return']:.2f}, peak force {record['force_peak']:.2f} N"
-        )
-
-
-if __name__ == "__main__":
-    with one_line_errors(__name__):
-        main()

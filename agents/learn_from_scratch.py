@@ -5,7 +5,9 @@
     surgsim evaluate --policy runs/palpate-seed0/policy.json
 
 Palpation plays a surrogate with a force formula (`surgsim_env.training.palpate_surrogate`), retraction 16 lobes side by
-side. The run's folder holds `progress.csv`, and at the end the policy.
+side. The run's folder holds checkpoints (pickles: resume only runs of your own), for each start `progress.csv` and
+`evaluations.npz` of the periodic evaluations, and at the end the policy. The same command resumes a run that was
+stopped.
 """
 
 import argparse
@@ -16,7 +18,7 @@ from typing import Any
 import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
@@ -30,8 +32,10 @@ from surgsim_env.training.policy_network import NetworkLayout, actor_of
 from surgsim_env.training.touch_features import TouchSummary
 
 ENVS, REPEAT = 16, 5
-# First seed of training; scores use seeds from 1,000,000.
-TRAINING_SEED = 2_000_000
+# Of each periodic evaluation.
+EPISODES = 48
+# Seeds of training and of its evaluations; scores use seeds from 1,000,000.
+TRAINING_SEED, EVALUATION_SEED = 2_000_000, 500_000
 COMMON: dict[str, Any] = {"n_steps": 64, "batch_size": 128, "n_epochs": 10, "gae_lambda": 0.95, "clip_range": 0.2}
 
 
@@ -132,22 +136,40 @@ def begin(recipe: Recipe, envs: VecEnv, seed: int) -> PPO:
     return model
 
 
-def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = None) -> PPO:
-    """Train, and write the policy.
+def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = None, every: int = 40_000) -> PPO:
+    """Train, or resume a run from its last checkpoint, and write the policy.
 
     Args:
         recipe: of the run.
         folder: of the run.
         seed: of environments, network and exploration.
         decisions: of the whole run, in place of the recipe's.
+        every: decisions between checkpoints, and between evaluations.
     """
     torch.set_num_threads(1)
+    total = decisions or recipe.decisions
     staged = make_envs(recipe, recipe.stages[0])
-    envs = VecNormalize(staged, norm_obs=False, gamma=recipe.settings["gamma"])
-    model = begin(recipe, envs, seed)
-    envs.seed(TRAINING_SEED + 100_000 * seed)
-    model.set_logger(configure(str(folder), ["csv"]))
-    model.learn(decisions or recipe.decisions, CurriculumCallback(recipe, staged))
+    saved = sorted(folder.glob("checkpoint_*_steps.zip"), key=lambda path: int(path.stem.split("_")[1]))
+    if saved:
+        steps = saved[-1].stem.split("_")[1]
+        envs = VecNormalize.load(str(folder / f"checkpoint_vecnormalize_{steps}_steps.pkl"), staged)
+        model = PPO.load(saved[-1], env=envs, device="cpu")
+    else:
+        envs = VecNormalize(staged, norm_obs=False, gamma=recipe.settings["gamma"])
+        model = begin(recipe, envs, seed)
+    envs.seed(TRAINING_SEED + 100_000 * seed + model.num_timesteps)
+    logs = str(folder / f"from_{model.num_timesteps}")
+    model.set_logger(configure(logs, ["csv"]))
+    evaluated = VecNormalize(make_envs(recipe, Stage()), training=False, norm_obs=False, norm_reward=False)
+    evaluated.seed(EVALUATION_SEED)
+    callbacks = [
+        CurriculumCallback(recipe, staged),
+        CheckpointCallback(every // ENVS, str(folder), "checkpoint", save_vecnormalize=True),
+        # The search is the policy's random walk: its mean action does not search.
+        EvalCallback(*(evaluated, None, None, EPISODES, every // ENVS), log_path=logs, deterministic=False, verbose=0),
+    ]
+    left = total - model.num_timesteps
+    model.learn(left, callbacks, reset_num_timesteps=model.num_timesteps == 0)  # type: ignore[arg-type]
     description = PolicyDescription(
         env_id=recipe.env_id,
         env_kwargs=recipe.env_kwargs,
@@ -167,9 +189,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="the run's folder; runs/RECIPE-seedSEED otherwise")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--decisions", type=int, help="in place of the recipe's")
+    parser.add_argument("--every", type=int, default=40_000, help="decisions between checkpoints and evaluations")
     given = parser.parse_args()
     folder = given.out or Path("runs") / f"{given.recipe}-seed{given.seed}"
-    model = train(RECIPES[given.recipe], folder, given.seed, decisions=given.decisions)
+    model = train(RECIPES[given.recipe], folder, given.seed, decisions=given.decisions, every=given.every)
     print(f"{model.num_timesteps} decisions; policy in {folder}/policy.json")
 
 

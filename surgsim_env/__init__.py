@@ -44,6 +44,7 @@ from surgsim_env.tasks.task import (
 
 if TYPE_CHECKING:
     from surgsim_env import scripting
+    from surgsim_env.envs.bimanual_parallel import BimanualRetractParallelEnv
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
     from surgsim_env.instruments.arm.arm import load_arm
     from surgsim_env.rendering.gl import NoGLError
@@ -54,6 +55,7 @@ __all__ = [
     "TIME_LEFT",
     "TIP_POSITION",
     "TIP_VELOCITY",
+    "BimanualRetractParallelEnv",
     "BimanualRetractTask",
     "Channel",
     "Command",
@@ -91,12 +93,13 @@ __all__ = [
 
 # Imported on first use: they need extras, or time that `import surgsim_env` should not take.
 _LAZY = {
+    "BimanualRetractParallelEnv": "surgsim_env.envs.bimanual_parallel",
     "NoGLError": "surgsim_env.rendering.gl",
     "RenderOptions": "surgsim_env.rendering.options",
     "VectorEnvForStableBaselines": "surgsim_env.envs.stable_baselines",
     "load_arm": "surgsim_env.instruments.arm.arm",
 }
-_EXTRAS = {"VectorEnvForStableBaselines": "agents"}
+_EXTRAS = {"BimanualRetractParallelEnv": "pettingzoo", "VectorEnvForStableBaselines": "agents"}
 
 
 def __getattr__(name: str) -> Any:

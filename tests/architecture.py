@@ -47,6 +47,7 @@ ORDER = {
             "lerobot_dataset",
             "record_demonstrations",
             "behaviour_cloning",
+            "train_rllib",
             "leaderboard",
         ),
     ),

@@ -110,6 +110,7 @@ HEAVY = {
     "meshio",
     "minari",
     "nibabel",
+    "pettingzoo",
     "pydicom",
     "pytetwild",
     "pyvista",

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from agents.command_line import one_line_errors
 
 import surgsim_env
-from agents.command_line import one_line_errors
 
 ROOT = Path(__file__).resolve().parents[2]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]

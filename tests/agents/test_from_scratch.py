@@ -1,4 +1,4 @@
-"""Learning from scratch: rewards of a curriculum, repeated actions, the touch summary, a run."""
+"""Learning from scratch: rewards of a curriculum, repeated actions, the touch summary, a run that is resumed."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -168,7 +168,7 @@ def test_the_touch_summary_is_what_it_says():
     assert np.abs(features).max() < 8.0
 
 
-def test_a_run_leaves_a_policy_that_plays(tmp_path: Path, monkeypatch):
+def test_a_run_leaves_a_policy_that_plays_and_is_resumed(tmp_path: Path, monkeypatch):
     from agents import learn_from_scratch
     from agents.learn_from_scratch import RECIPES, train
     from surgsim_env.training.curriculum import Stage
@@ -178,9 +178,12 @@ def test_a_run_leaves_a_policy_that_plays(tmp_path: Path, monkeypatch):
     stages = (recipe.stages[0], Stage(256, novelty=0.1))
     recipe = replace(recipe, stages=stages, settings={**recipe.settings, "n_steps": 8, "batch_size": 32, "n_epochs": 1})
     monkeypatch.setattr(learn_from_scratch, "ENVS", 4)
-    model = train(recipe, tmp_path, 0, decisions=288)
-    assert model.num_timesteps == 288 and model.get_env().venv.stage == stages[1]
-    assert (tmp_path / "progress.csv").is_file()
+    monkeypatch.setattr(learn_from_scratch, "EPISODES", 4)
+    model = train(recipe, tmp_path, 0, decisions=64, every=64)
+    assert model.num_timesteps == 64 and model.get_env().venv.stage == stages[0]
+    again = train(recipe, tmp_path, 0, decisions=288, every=288)
+    assert again.num_timesteps == 288 and again.get_env().venv.stage == stages[1]
+    assert (tmp_path / "from_64" / "progress.csv").is_file() and (tmp_path / "from_0" / "evaluations.npz").is_file()
     policy = load_policy(tmp_path / "policy.json")
     assert policy.description.trained_steps == 288 and policy.description.action_repeat == 5
     envs = environments(None)

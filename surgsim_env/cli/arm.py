@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from surgsim_env.cli.values import MaybeNumber, MaybePath, MaybeText, vector_of
 from surgsim_env.reports.output_folder import output_folder
+from surgsim_env.reports.step_progress import StepProgress
 
 if TYPE_CHECKING:
     from surgsim_env.instruments.arm.arm import Arm as ArmKinematics
@@ -103,15 +103,9 @@ class Arm:
         names = f"{stem}.toml", f"{stem}.png"
         if (folder / names[0]).exists():
             raise ValueError(f"{folder / names[0]} is there already: remove it, or give another --out")
-        with _progress(console) as bar:
-            task = bar.add_task("", total=1.0)
-            found = find_arm(
-                self.file,
-                tip=self.tip,
-                trocar=vector_of("--trocar", self.trocar),
-                tool_length=self.tool,
-                tell=lambda what, share: bar.update(task, description=what, completed=share),
-            )
+        trocar = vector_of("--trocar", self.trocar)
+        with StepProgress(console) as progress, progress.step("finding tip, trocar and home"):
+            found = find_arm(self.file, tip=self.tip, trocar=trocar, tool_length=self.tool)
         for sentence in found.found:
             console.print(f"found: {sentence}", highlight=False, soft_wrap=True)
         for sentence in found.chosen:
@@ -158,8 +152,3 @@ def _draw(arm: ArmKinematics, path: Path, console: Console) -> bool:
         return False
     imsave(path, picture, format="png")
     return True
-
-
-def _progress(console: Console) -> Progress:
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    return Progress(*columns, console=console, transient=True)

@@ -5,7 +5,7 @@ trocar is chosen together with home, or given and a home searched whose shaft pa
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -57,8 +57,6 @@ SMALL_PART = 0.04
 ONE_MM = 1e-3
 FREE, COUPLING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtEq.mjEQ_JOINT)
 
-Tell = Callable[[str, float], None]
-
 
 @dataclass
 class FoundArm:
@@ -108,7 +106,6 @@ def find_arm(
     tip: str | None = None,
     trocar: Vector | None = None,
     tool_length: float | None = None,
-    tell: Tell | None = None,
 ) -> FoundArm:
     """Make a palpating arm from an MJCF or URDF file.
 
@@ -117,22 +114,17 @@ def find_arm(
         tip: link or site of the tip, or to which a tool is mounted; by default the end of the longest chain of joints.
         trocar: point of the trocar in the model's own frame [m]; by default the remote centre, or chosen with home.
         tool_length: mount a straight palpator of this length [m], even if the model has a shaft.
-        tell: called with the current work and the share that is done.
 
     Raises:
         ValueError: a file that cannot be read, a tip that is not there, a trocar that no pose reaches.
     """
-    tell = tell or (lambda _what, _share: None)
-    tell("reading the model", 0.0)
     survey = ModelSurvey(path)
-    return _Finder(survey, tip, trocar, tool_length, tell).found
+    return _Finder(survey, tip, trocar, tool_length).found
 
 
 class _Finder:
-    def __init__(
-        self, survey: ModelSurvey, tip: str | None, trocar: Vector | None, tool_length: float | None, tell: Tell
-    ) -> None:
-        self.survey, self.model, self.tell = survey, survey.model, tell
+    def __init__(self, survey: ModelSurvey, tip: str | None, trocar: Vector | None, tool_length: float | None) -> None:
+        self.survey, self.model = survey, survey.model
         self.notes, self.chosen, self.comments = [], [], {}
         body, offset = survey.find_tip(tip)
         self.chain = survey.chain(body)
@@ -402,8 +394,7 @@ class _Finder:
         best = None
         starts = self._good_starts(arm) if self.centre is None else self._starts_about(self.centre)
         places = [(start, place) for start in starts for place in self._trocars(arm, start)]
-        for number, (start, place) in enumerate(places):
-            self.tell("looking for a home", 0.1 + 0.8 * number / len(places))
+        for start, place in places:
             arm.trocar = place
             into = arm.shaft_line(start)[1]
             found = self._at_depth(arm, place, into, start)
@@ -612,7 +603,6 @@ class _Finder:
         into: FloatArray,
         reach: float,
     ) -> FoundArm:
-        self.tell("servos", 0.95)
         clipped = home.round(9).clip(self.lower, self.upper)
         arm = self._search_arm(link_shapes)
         control = self._control(arm, clipped)
@@ -625,7 +615,6 @@ class _Finder:
             f"home with the tip {1e3 * HOME_DEPTH:.0f} mm past the trocar; the tip reaches {reach:.0%} of the places "
             f"6 to 14 cm past it, up to {math.degrees(TILT):.0f} degrees aside"
         )
-        self.tell("done", 1.0)
         return FoundArm(description, self.notes, self.chosen, self.comments, reach)
 
 

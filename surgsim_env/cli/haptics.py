@@ -144,10 +144,7 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
     if command.device_damping is None:
         return None
     if command.trajectory is not None:
-        raise ValueError(
-            f"--device-damping is {command.device_damping:g}, but a --trajectory is no device that pushes back; give "
-            "only one of both"
-        )
+        raise ValueError("--device-damping: a --trajectory is no device that pushes back; give only one of both")
     return DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
 
 

@@ -28,15 +28,6 @@ RENDER_MODES = ("human", "rgb_array")
 PLAYING_KEYS = "ADEFQRSW "
 
 
-def require_display() -> None:
-    """Raise a NoGLError if there is no display for a window."""
-    if not gl.has_display():
-        raise gl.NoGLError(
-            f'render_mode "human" opens a window, and there is no display ({" and ".join(gl.DISPLAYS)} are not set): '
-            'use render_mode="rgb_array", which needs none'
-        )
-
-
 class WindowContext:
     """A GLFW window as a graphics context."""
 
@@ -46,7 +37,6 @@ class WindowContext:
         Raises:
             NoGLError: there is no display, or no OpenGL on it.
         """
-        require_display()
         import glfw
 
         self._glfw = glfw
@@ -149,8 +139,11 @@ class EpisodeView:
         """
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode {render_mode!r} is unknown; the modes are None, {', '.join(RENDER_MODES)}")
-        if render_mode == "human":
-            require_display()
+        if render_mode == "human" and not gl.has_display():
+            raise gl.NoGLError(
+                f'render_mode "human" opens a window, and there is no display ({" and ".join(gl.DISPLAYS)} are not '
+                'set): use render_mode="rgb_array", which needs none'
+            )
         self.mode = render_mode
         self.options = render_options(given)
         self._simulation = simulation

@@ -303,7 +303,8 @@ def shown_geoms(model: mujoco.MjModel) -> list[int]:
     for geom in range(model.ngeom):
         group, body = int(model.geom_group[geom]), int(model.geom_bodyid[geom])
         wanted = group < CONTACT_GROUP or (group == CONTACT_GROUP and body not in dressed)
-        if wanted and _is_drawn(model, geom) and geom_colour(model, geom)[3] > 0.0:
+        has_shape = int(model.geom_type[geom]) in _DRAWN_TYPES or is_support(model, geom)
+        if wanted and has_shape and geom_colour(model, geom)[3] > 0.0:
             shown.append(geom)
     return shown
 
@@ -339,10 +340,6 @@ def find_instrument(drawn: mujoco.MjModel, model: mujoco.MjModel, prefix: str = 
         source=np.array(source, dtype=np.int64),
         target=np.array([drawn.geom(_name(model, geom, prefix)).id for geom in source], dtype=np.int64),
     )
-
-
-def _is_drawn(model: mujoco.MjModel, geom: int) -> bool:
-    return int(model.geom_type[geom]) in _DRAWN_TYPES or is_support(model, geom)
 
 
 def is_support(model: mujoco.MjModel, geom: int) -> bool:

@@ -154,14 +154,10 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def shown_name(result: Result) -> str:
-    """A method's name as tables and pictures show it."""
-    side = result.method.removeprefix("raster_")
-    return f"raster {side} x {side}" if side != result.method else result.method
-
-
 def _name(result: Result) -> str:
-    return shown_name(result) + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
+    side = result.method.removeprefix("raster_")
+    name = f"raster {side} x {side}" if side != result.method else result.method
+    return name + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
 
 
 def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from surgsim_env.palpation.scores import EVALUATION_SEEDS
-from surgsim_env.scene.model import SPLITS
 from surgsim_env.scoring.results import read_seeds
 
 
@@ -45,8 +44,6 @@ class ScoringOptions:
     """Folder of result files; default: agents/results of a checkout."""
 
     def __post_init__(self) -> None:
-        if self.split is not None and self.split not in SPLITS:
-            raise ValueError(f"--split is {self.split!r}; it is one of {', '.join(SPLITS)}")
         for name in ("envs", "threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")

@@ -148,7 +148,7 @@ def test_wrong_options_are_refused() -> None:
     for arguments, message in (
         ([], "give one of --agent, --policy, --all, --compare; given: none"),
         (["--agent", "gp_ucb", "--all"], "given: --agent and --all"),
-        (["--agent", "gp_ucb", "--split", "tset"], "--split is 'tset'"),
+        (["--agent", "gp_ucb", "--split", "tset"], "split 'tset' is unknown"),
         (["--agent", "my:Own", "--env-arguments", "[1]"], "--env-arguments is '[1]'"),
         (["--agent", "gp_ucb", "--episodes", "101"], "--episodes is 101"),
         (["--agent", "gp_ucb", "--seeds", "5:9", "--episodes", "6"], "--episodes is 6"),

@@ -18,6 +18,7 @@ from websockets.http11 import Request, Response
 from surgsim_env.live.exchange_records import LiveError
 
 LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
 # Sockets of keyboards, gamepads and frame rates: `hand.js` opens them.
 HAND_PATH = "/hand"
 # In this order: the second sends the server what the first counts.
@@ -28,11 +29,12 @@ Answer = Callable[[ServerConnection, Request], Response | None]
 
 
 class GuardedServer:
-    """A viser server that listens on 127.0.0.1 and checks the token of each request.
+    """A viser server that listens on 127.0.0.1 and checks Host, Origin and token of each request.
 
-    The token stops other accounts of the machine and pages of other sites. It is the first part of every path, of the
-    page and of its sockets: viser's page opens its socket below its own address. A cookie would also reach every other
-    server on the same host, as cookies do not distinguish ports.
+    The check of Host stops DNS rebinding, the check of Origin stops sockets opened by pages of other sites, and the
+    token stops other accounts of the machine. The token is the first part of every path, of the page and of its
+    sockets: viser's page opens its socket below its own address. A cookie would also reach every other server on the
+    same host, as cookies do not distinguish ports.
 
     viser has no parameter for the function that websockets calls with each request (`process_request`), so
     `websockets.asyncio.server.serve`, which viser opens its port with, is replaced while viser starts. If a later viser
@@ -93,10 +95,9 @@ class GuardedServer:
         """The response to a request: a refusal, viser's page with our scripts, or None to open a socket."""
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
-            if self._path_behind_token(request) is None:
-                return _refuse("open the whole address that `surgsim view` printed (token)")
-            if "Upgrade" in request.headers:
-                return None
+            refusal = self._refusal(connection.local_address[1], request)
+            if refusal is not None or "Upgrade" in request.headers:
+                return refusal
             # Not compressed, so that the scripts can be inserted.
             if "Accept-Encoding" in request.headers:
                 del request.headers["Accept-Encoding"]
@@ -105,6 +106,18 @@ class GuardedServer:
             return _with_scripts(response) if response is not None and request.path == "/" else response
 
         return answer
+
+    def _refusal(self, port: int, request: Request) -> Response | None:
+        """A response that refuses a request to a port with its reason, or None for an accepted one."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1 or hosts[0] not in [f"{name}:{port}" for name in NAMES]:
+            return _refuse(http.HTTPStatus.MISDIRECTED_REQUEST, "this server has another name (Host)")
+        # A browser sends the origin of the page with each socket that the page opens.
+        if origins != [f"http://{hosts[0]}"] and (origins or "Upgrade" in request.headers):
+            return _refuse(http.HTTPStatus.FORBIDDEN, "the request comes from another site's page (Origin)")
+        if self._path_behind_token(request) is None:
+            return _refuse(http.HTTPStatus.UNAUTHORIZED, "open the whole address that `surgsim view` printed (token)")
+        return None
 
     def _path_behind_token(self, request: Request) -> str | None:
         """The path of a request without its token and its query, "/" for the page; None without the token."""
@@ -122,9 +135,8 @@ def _with_scripts(response: Response) -> Response:
     return Response(response.status_code, response.reason_phrase, headers, body)
 
 
-def _refuse(reason: str) -> Response:
+def _refuse(status: http.HTTPStatus, reason: str) -> Response:
     """A short response in plain text that closes the connection."""
-    status = http.HTTPStatus.UNAUTHORIZED
     body = f"surgsim: {reason}\n".encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
     headers["Connection"] = "close"

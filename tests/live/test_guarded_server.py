@@ -53,15 +53,37 @@ def test_the_page_comes_with_the_token_alone(server):
         assert body.index(b"getGamepads") < body.index(b"</head>")
 
 
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        *(("127.0.0.1:{}", 200), ("localhost:{}", 200), ("evil.example:{}", 421), ("127.0.0.1", 421)),
+        *(("127.0.0.1.evil.example:{}", 421), ("127.0.0.1:1", 421), ("192.168.0.7:{}", 421), ("x@127.0.0.1:{}", 421)),
+    ],
+)
+def test_a_name_of_another_machine_is_refused(server, host, status):
+    assert get(server, f"/{server.token}", Host=host.format(server.viser.get_port()))[0] == status
+
+
+def test_a_page_of_another_site_is_refused(server, own):
+    assert get(server, f"/{server.token}", Origin=f"http://{own}")[0] == 200
+    for origin in ("http://evil.example", "null", f"https://{own}"):
+        assert get(server, f"/{server.token}", Origin=origin)[0] == 403
+
+
 @pytest.mark.parametrize("path", ["/", "/hand", "/elsewhere"])
-def test_no_socket_is_opened_without_the_token(server, own, path):
+@pytest.mark.parametrize(
+    ("origin", "token", "status"),
+    [(None, None, 403), ("http://evil.example", None, 403), ("", "wrong", 401)],
+)
+def test_no_socket_is_opened_without_origin_and_token(server, own, path, origin, token, status):
     async def attempt():
-        async with connect(f"ws://{own}/wrong{path}", open_timeout=SECONDS):
+        address = f"ws://{own}/{token or server.token}{path}"
+        async with connect(address, origin=f"http://{own}" if origin == "" else origin, open_timeout=SECONDS):
             pass
 
     with pytest.raises(InvalidStatus) as refused:
         asyncio.run(attempt())
-    assert refused.value.response.status_code == 401
+    assert refused.value.response.status_code == status
 
 
 def test_viser_and_the_hands_have_sockets_below_the_token(server, own):

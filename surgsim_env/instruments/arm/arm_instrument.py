@@ -178,13 +178,13 @@ def check_port_outside(port: Port, anatomy: Anatomy, *, what: str = "the port") 
         ValueError: the port is inside (names its place and the organ).
     """
     corners = anatomy.mesh.points[anatomy.mesh.tets]
-    # It is in a tet whose volume stays positive whichever corner is moved to it.
+    # It is in a tet whose volume [m^3] stays positive, but for rounding on a face, whichever corner is moved to it.
     inside = np.ones(len(corners), dtype=bool)
     for corner in range(4):
         moved = corners.copy()
         moved[:, corner] = port.point
         a, b, c = (moved[:, index] - moved[:, 0] for index in (1, 2, 3))
-        inside &= (np.cross(a, b) * c).sum(axis=1) > 0.0
+        inside &= (np.cross(a, b) * c).sum(axis=1) >= -1e-15
     if inside.any():
         raise ValueError(
             f"{what} at {millimetres(np.array(port.point))} lies inside the organ of scene {anatomy.scene.name!r}: "

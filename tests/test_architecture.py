@@ -90,7 +90,6 @@ UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
     "surgsim_env/patient/label_image.py": (("sum",), "counts"),
     "surgsim_env/patient/lesion_room.py": (("sum",), "counts"),
     "surgsim_env/scene/model.py": (("sum",), "counts"),
-    "surgsim_env/scoring/evaluate.py": (("sum",), "counts"),
     "surgsim_env/scoring/site_search.py": (("scipy.stats",), "Sobol's sequence, of whole numbers"),
     "surgsim_env/scripting/run.py": (("sum",), "counts"),
 }

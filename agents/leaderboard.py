@@ -58,7 +58,7 @@ TASKS: tuple[Column, ...] = (
 def write_leaderboard(folder: Path, path: Path) -> None:
     """Write the tables of all results of a folder."""
     results = load_results(folder)
-    places = sorted({result.place for result in results}, key=_order)
+    places = sorted(sorted({result.place for result in results}), key=_order)
     parts = [HEADER]
     for place in places:
         rows = [result for result in results if result.place == place]

@@ -27,7 +27,8 @@ FOLLOWING_TIME = 0.010
 # Interval of the readings that `press_phases` averages [s]; `recorded_phases` reads every haptic step.
 READING_TIME = 0.010
 
-Tool, Result = TypeVar("Tool"), TypeVar("Result")
+Tool = TypeVar("Tool")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,6 @@ def test_what_is_written_is_read(tmp_path):
         ("site,depth_mm\n", "'normal_force_n'"),
         (f"{HEADER}\n", "samples"),
         ("site,depth_mm,normal_force_n,x_mm\n0,1,1,1\n", "y_mm"),
-        ("site,depth_mm,normal_force_n,site\n0,1,1,1\n", "'site'"),
         ("site,depth_mm,normal_force_n\n0,1,much\n", "line 2: .*'much'"),
         ("site,depth_mm,normal_force_n\n0.5,1,1\n", "0.5"),
         ("site,depth_mm,normal_force_n\n0,3000,1\n", "'3000'"),

@@ -15,7 +15,7 @@ class Identify:
     """Identify a material from recorded presses: modulus, stiffening, relaxation, offset and thickness, with intervals.
 
     Fits half of the sites and reports the error on the other half, beside the best linear tissue. Writes material.toml
-    (for any scene file), sites.csv and curves.png. See docs/identify.md.
+    (for any scene file), sites.csv, curves.png, modulus_map.png and summary.json. See docs/identify.md.
     """
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
@@ -58,6 +58,9 @@ class Identify:
             results.write_material(found, files / results.MATERIAL_NAME, self.command_line)
             results.write_sites(found, files / results.SITES_NAME)
             results.write_curves(found, files / results.CURVES_NAME)
+            has_map = results.write_map(found, files / results.MAP_NAME)
+            results.write_summary(found, files / results.SUMMARY_NAME, self.command_line)
         results.print_result(found, console)
-        console.print(f"written: {files.path}/{{{','.join(results.RESULT_NAMES)}}}", highlight=False, soft_wrap=True)
+        written = [name for name in results.RESULT_NAMES if has_map or name != results.MAP_NAME]
+        console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0

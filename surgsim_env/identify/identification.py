@@ -1,6 +1,7 @@
 """From recorded sets to one material, its errors on held-out sites, and what the data cannot tell."""
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -120,6 +121,7 @@ class Identification:
         relaxation: arms, where presses were held; relative moduli are those of the springs
         other_ratios: for each other Poisson's ratio: error on the training sites, and factor on the modulus
         warnings: what the data cannot tell, one sentence each
+        seconds: wall time
     """
 
     options: IdentifyOptions
@@ -132,6 +134,7 @@ class Identification:
     relaxation: RelaxationFit | None
     other_ratios: dict[float, tuple[float, float]]
     warnings: tuple[str, ...]
+    seconds: float
 
     @property
     def shape(self) -> PressShape:
@@ -172,6 +175,7 @@ def identify(
     Raises:
         ValueError: a set with too few usable sites; says how many are left out and why.
     """
+    begin = time.perf_counter()
     library = make_library(recordings, options) if library is None else library
     sorted_sets = [sort_out(recording.presses) for recording in recordings]
     for recording, (usable, left_out) in zip(recordings, sorted_sets):
@@ -227,7 +231,8 @@ def identify(
             )
         )  # fmt: skip
     result = Identification(
-        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, ()
+        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, (),
+        time.perf_counter() - begin,
     )  # fmt: skip
     return replace(result, warnings=tuple(_warnings(result, library)))
 

@@ -63,6 +63,16 @@ class Recording:
     name: str
     presses: tuple[SitePress, ...]
 
+    @property
+    def has_time(self) -> bool:
+        """Whether the samples have times."""
+        return self.presses[0].time is not None
+
+    @property
+    def has_places(self) -> bool:
+        """Whether all sites have a place."""
+        return all(np.isfinite(press.place).all() for press in self.presses)
+
 
 def read_recording(path: Path) -> Recording:
     """Read a set from a CSV file with the columns that this module lists.

@@ -35,12 +35,14 @@ class RelaxationFit:
         relative_moduli, times: as in the organ's material, times increasing
         error: median |F_model - F| / F over the samples from a third of the depth on
         elastic_error: the same without arms
+        time_range: shortest and longest time since the start of the press that the samples tell [s]
     """
 
     relative_moduli: tuple[float, ...]
     times: tuple[float, ...]
     error: float
     elastic_error: float
+    time_range: tuple[float, float]
 
 
 def held_sites(sites: Sequence[SitePress]) -> list[SitePress]:
@@ -183,6 +185,7 @@ def fit_relaxation(
         best.times,
         error=others.with_offsets(curve, best, offsets).error(curve, best),
         elastic_error=others.with_offsets(curve, Arms(), offsets).error(curve, Arms()),
+        time_range=(shortest, longest),
     )
 
 

@@ -1,6 +1,7 @@
-"""Results of an identification: a material for scene files, sites as CSV, a picture, a table."""
+"""Results of an identification: a material for scene files, sites as CSV, pictures, a summary, a table."""
 
 import csv
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,11 @@ from tomlkit.items import Table as TomlTable
 
 from surgsim_env.identify.identification import Identification, SetResult
 
-MATERIAL_NAME, SITES_NAME, CURVES_NAME = "material.toml", "sites.csv", "curves.png"
-RESULT_NAMES = (MATERIAL_NAME, SITES_NAME, CURVES_NAME)
+MATERIAL_NAME, SITES_NAME, CURVES_NAME, MAP_NAME, SUMMARY_NAME = (
+    *("material.toml", "sites.csv", "curves.png", "modulus_map.png"),
+    "summary.json",
+)
+RESULT_NAMES = (MATERIAL_NAME, SITES_NAME, CURVES_NAME, MAP_NAME, SUMMARY_NAME)
 COLUMNS = (
     *("set", "site", "x", "y", "z", "half", "youngs_modulus", "contact_offset", "error"),
     *("linear_youngs_modulus", "linear_error"),
@@ -119,6 +123,55 @@ def write_sites(result: Identification, path: Path) -> None:
                 writer.writerow([one.recording.name, site.site, *place, half, *(f"{value:.6g}" for value in values)])
 
 
+def summary(result: Identification, command_line: str) -> dict[str, Any]:
+    """The identification as plain values, for `summary.json`."""
+    return {
+        "command": command_line,
+        "material": material_tables(result),
+        "thickness": rounded(result.shape.thickness),
+        "intervals": {
+            name: {"value": rounded(one.value), "low": rounded(one.low), "high": rounded(one.high), "told": one.told}
+            for name, one in result.found.intervals.items()
+        },
+        "linear": {"thickness": rounded(result.linear.thickness), "is_as_good": result.is_linear},
+        "sets": {
+            one.recording.name: {
+                "sites": len(one.recording.presses),
+                "used": len(one.fits.samples),
+                "training": int(one.is_training.sum()),
+                "left_out": one.left_out,
+                "modulus_median": rounded(float(np.median(one.fits.modulus))),
+                "offset_median": rounded(float(np.median(one.fits.offset))),
+                "held_out_error": {"median": rounded(one.error.median), "high": rounded(one.error.high)},
+                "held_out_error_linear": {
+                    "median": rounded(one.linear_error.median),
+                    "high": rounded(one.linear_error.high),
+                },
+            }
+            for one in result.sets
+        },
+        "relaxation": None
+        if result.relaxation is None
+        else {
+            "held_out_error": rounded(result.relaxation.error),
+            "held_out_error_elastic": rounded(result.relaxation.elastic_error),
+            "time_range": [rounded(one) for one in result.relaxation.time_range],
+        },
+        "other_poisson_ratios": {
+            f"{ratio:g}": {"training_error": rounded(error), "modulus_factor": rounded(factor)}
+            for ratio, (error, factor) in result.other_ratios.items()
+        },
+        "warnings": list(result.warnings),
+        "press_count": result.found.press_count,
+        "seconds": rounded(result.seconds),
+    }
+
+
+def write_summary(result: Identification, path: Path, command_line: str) -> None:
+    """Write `summary` as JSON."""
+    path.write_text(json.dumps(summary(result, command_line), indent=2) + "\n", encoding="utf-8")
+
+
 def error_table(sets: Sequence[SetResult]) -> Table:
     """The errors of sets on held-out sites, beside those of the best linear tissue."""
     table = Table()
@@ -215,3 +268,24 @@ def _draw_all(axes: Any, one: SetResult, result: Identification) -> None:
     )
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+
+
+def write_map(result: Identification, path: Path) -> bool:
+    """Draw the moduli of the sites over x and y; whether any set states the places of its sites."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    sets = [one for one in result.sets if one.recording.has_places]
+    if not sets:
+        return False
+    figure = Figure(figsize=(6.4 * len(sets), 5.2), layout="constrained")
+    for one, axes in zip(sets, figure.subplots(1, len(sets), squeeze=False)[0]):
+        place = np.array([site.place for site in one.fits.samples.sites])
+        low, high = np.percentile(one.fits.modulus, [2.0, 98.0])
+        norm = LogNorm(low, max(high, 1.01 * low))
+        dots = axes.scatter(1e3 * place[:, 0], 1e3 * place[:, 1], c=one.fits.modulus, norm=norm, cmap="magma", s=40)
+        axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+        axes.set_title(f"{one.recording.name}: Young's modulus of each site", size=9)
+        figure.colorbar(dots, ax=axes, label="Young's modulus [Pa]")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    return True

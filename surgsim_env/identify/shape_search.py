@@ -197,11 +197,17 @@ class FoundShape:
     Fields:
         shape, curve: thickness and law, and its run
         intervals: of each parameter that was searched, by its name
+        training_count: sites that chose the shape
+        cost: mean error of the training sites but the worst
+        press_count: runs of the forward model so far
     """
 
     shape: PressShape
     curve: SampledCurve
     intervals: dict[str, Interval]
+    training_count: int
+    cost: float
+    press_count: int
 
 
 def trimmed_mean(errors: FloatArray) -> FloatArray:
@@ -250,6 +256,9 @@ def find_shape(
         shape=shape,
         curve=library.sampled(library.curves[best]),
         intervals=_intervals(library, parts, best, looked_at),
+        training_count=errors.shape[1],
+        cost=float(trimmed_mean(errors)[best]),
+        press_count=len(library.curves) + len(library.linear_curves) + len(library.failed),
     )
 
 

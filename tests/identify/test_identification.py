@@ -1,6 +1,7 @@
 """The whole identification on made recordings, with a closed-form press in place of the organ's."""
 
 import csv
+import json
 import tomllib
 from dataclasses import replace
 
@@ -142,14 +143,16 @@ def test_the_command_writes_a_set_of_results(run):
     folder, said = run
     assert {path.name for path in folder.iterdir()} == set(RESULT_NAMES)
     assert "tangent_cap" in said and "note: poisson_ratio is given" in " ".join(said.split())
-    picture = imread(folder / "curves.png")
-    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+    for name in ("curves.png", "modulus_map.png"):
+        picture = imread(folder / name)
+        assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
     with (folder / "sites.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert tuple(rows[0]) == COLUMNS and len(rows) == 24
     assert sum(row["half"] == "held out" for row in rows) == 12
-    material = tomllib.loads((folder / "material.toml").read_text(encoding="utf-8"))["material"]
-    assert material["youngs_modulus"] == pytest.approx(
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary["sets"]["liver"]["used"] == 24
+    assert summary["material"]["youngs_modulus"] == pytest.approx(
         np.median([float(row["youngs_modulus"]) for row in rows]), rel=1e-3
     )
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from surgsim_env.envs.ids import BimanualRetractEnv
-from surgsim_env.tasks.bimanual_retract import LEFT_SIZE
 
+# Entries of the joint action that are the left arm's: velocity, turning and jaw.
+LEFT_SIZE = 7
 AGENTS = ("left", "right")
 
 

@@ -3,10 +3,9 @@
 import csv
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.haptics.device import DevicePose
@@ -136,7 +135,7 @@ class TrajectoryDevice:
         """
         self._time, self._position = time, position
         self._buttons = np.zeros(len(time), dtype=np.int32) if buttons is None else np.asarray(buttons)
-        self._has_place: NDArray[np.bool_] = np.isfinite(position).all(axis=1)
+        self._has_place: Any = np.isfinite(position).all(axis=1)
         self.force = np.zeros(3)
         self._step = 0
         self._haptic_step = haptic_step

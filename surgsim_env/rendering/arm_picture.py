@@ -34,8 +34,9 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     points = np.concatenate([_box_corners(arm.model, data), [arm.trocar, tip]])
     aside = np.cross(up, arm.trocar - points.mean(axis=0))
     # Of an arm whose middle is above the trocar every side shows as much.
-    aside = aside / length if (length := float(np.linalg.norm(aside))) > 1e-6 else arm.port.rotation[:, 1]
-    direction = aside + AHEAD * np.cross(aside, up) + ABOVE * up
+    length = float(np.linalg.norm(aside))
+    aside = aside / length if length > 1e-6 else arm.port.rotation[:, 1]
+    direction: FloatArray = aside + AHEAD * np.cross(aside, up) + ABOVE * up
     camera = filling(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
     ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
     return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]

@@ -49,7 +49,8 @@ class BimanualRetractTask(RetractTask):
     ## Description
     The lobe of `SurgSim/Retract-v0` hides a disc on its bed. The left of two robot arms grasps the lobe and folds it
     back; the right one reaches under it and touches the disc gently for half a second. Tissue, bed and arms exchange
-    forces 1000 times a second; one agent commands both arms 20 times a second.
+    forces 1000 times a second; one agent commands both arms 20 times a second. `surgsim_env.envs.bimanual_parallel` is
+    the same for two agents.
 
     ## Action Space
     `Box(-1, 1, (13,), float32)`

@@ -29,8 +29,8 @@ QUICK = {
     # The evaluation looks for ports before all else; the slow test runs it.
     "own_robot": [("surgsim arms --left psm_grasper", "pip # --left psm_grasper")],
 }
-# An organ of one's own from a mesh to an agent, and six episodes of a controller.
-SLOW = {"own_organ", "test_a_controller"}
+# An organ of one's own from a mesh to an agent, a scan from its labels to maps, and six episodes of a controller.
+SLOW = {"own_organ", "own_patient", "test_a_controller"}
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 # Frames of tables.
 FRAME = re.compile("[\u2500-\u257f|]")

@@ -112,7 +112,7 @@ def test_a_scene_chooses_the_stiffness_rule():
     springs = lloyd.organ(lesion).spring_stiffness
     factor = factor[spring_order(fitted.mesh).springs]
     np.testing.assert_array_equal(fitted.organ(lesion).spring_stiffness, factor * springs)
-    with pytest.raises(ValueError, match=r"scene 'changed': stiffness rule 'fited' is unknown.*did you mean 'fitted'"):
+    with pytest.raises(ValueError, match=r"scene 'changed': stiffness rule 'fited' is unknown"):
         changed(stiffness_rule="fited")
 
 

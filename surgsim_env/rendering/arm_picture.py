@@ -1,6 +1,7 @@
 """A picture of one arm with its meshes, its shaft in a trocar."""
 
 from itertools import product
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -36,7 +37,7 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     # Of an arm whose middle is above the trocar every side shows as much.
     length = float(np.linalg.norm(aside))
     aside = aside / length if length > 1e-6 else arm.port.rotation[:, 1]
-    direction: FloatArray = aside + AHEAD * np.cross(aside, up) + ABOVE * up
+    direction: Any = aside + AHEAD * np.cross(aside, up) + ABOVE * up
     camera = filling(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
     ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
     return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]

@@ -20,8 +20,8 @@ def test_two_workers_learn_and_the_agent_plays(tmp_path: Path):
     learn = ["-m", "agents.train_rllib", "--iterations", "1", "--batch", "320"]
     done = subprocess.run([sys.executable, *learn], **settings)
     assert done.returncode == 0 and "iteration 0: return" in done.stdout, done.stdout + done.stderr
-    place = ["--env", "SurgSim/Palpate-v0", "--level", "standard", "--seeds", "3", "--submit", "score.json"]
+    place = ["--env", "SurgSim/Palpate-v0", "--level", "standard", "--seeds", "3", "--results", "scores"]
     score = ["-m", "surgsim_env.cli.main", "evaluate", "--agent", "agents.train_rllib:Trained", *place]
     arguments = ["--env-arguments", '{"memory": true, "max_episode_steps": 5}']
     done = subprocess.run([sys.executable, *score, *arguments], **settings)
-    assert done.returncode == 0 and (tmp_path / "score.json").is_file(), done.stdout + done.stderr
+    assert done.returncode == 0 and len(list((tmp_path / "scores").glob("*.json"))) == 1, done.stdout + done.stderr

@@ -29,7 +29,7 @@ def test_the_formula_presses_as_the_organ_does():
     made = surrogate(1)
     made.reset(seed=0)
     compared = 0
-    for seed in range(30):
+    for seed in range(120):
         observation, _ = env.reset(seed=seed)
         task = env.task
         if np.linalg.norm(observation[:2] - task.lesion.centre[:2]) < 0.022 or compared == 2:

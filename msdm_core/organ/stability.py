@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from msdm_core.arithmetic import dot, eigh, exp, matmul, norm, power, sin
+from msdm_core.arithmetic import ANGLE_MOST, dot, eigh, exp, matmul, norm, power, sin
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import SWEEPS
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
@@ -95,8 +95,9 @@ def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = Non
     if count < 60:
         matrix = np.column_stack([apply(column) for column in np.eye(count)])
         return math.sqrt(max(float(eigh(0.5 * (matrix + matrix.T))[0][-1]), 0.0))
-    # A fixed start without symmetry: the same organ gives the same step, to the bit.
-    start = sin(1.0 + 1.7 * power(np.arange(count), 1.1))
+    # A fixed start without symmetry: the same organ gives the same step, to the bit. Of more than 48 000 nodes some
+    # angles are beyond those that `sin` takes.
+    start = sin(np.fmod(1.0 + 1.7 * power(np.arange(count), 1.1), ANGLE_MOST))
     return math.sqrt(_largest_eigenvalue(apply, start) * (1.0 + EIGENVALUE_TOLERANCE))
 
 

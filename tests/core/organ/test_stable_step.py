@@ -97,3 +97,9 @@ def test_implicit_contact_asks_for_no_shorter_step(law: ContactLaw):
     model = organ()
     assert stable_dt(model, law) == model.stable_step
     assert growth(model, law, 0.95 * model.stable_step) < 30.0
+
+
+def test_a_fine_organ_has_the_step_of_its_cells():
+    """52 000 nodes: the step of the cells of a tenth of it, to the share that the faces of a block change."""
+    fine, coarse = (oracle.block((1e-3 * count,) * 3, (count,) * 3, anchored_below=0.0) for count in (37, 17))
+    assert fine.stable_step == pytest.approx(coarse.stable_step, rel=0.02)

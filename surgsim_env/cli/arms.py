@@ -37,7 +37,7 @@ class Arms:
     scene: str = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     compare: tuple[str, ...] = ()
-    """Other ports files, or arms for both sides, to be ranked in one table with reasons."""
+    """Other ports files, or arms for both sides, to be ranked in one table."""
     points: int = 500
     """Number of points of the organ to be tried."""
     seed: int = 0

@@ -64,11 +64,6 @@ class Recording:
     presses: tuple[SitePress, ...]
 
     @property
-    def has_time(self) -> bool:
-        """Whether the samples have times."""
-        return self.presses[0].time is not None
-
-    @property
     def has_places(self) -> bool:
         """Whether all sites have a place."""
         return all(np.isfinite(press.place).all() for press in self.presses)

@@ -29,6 +29,9 @@ def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[
     points, faces = parsed(file, _loaded, "export it again as STL, OBJ or PLY")
     if len(faces) == 0:
         raise MeshError(f"{file}: has no triangles ({len(points)} vertices); export a triangulated surface")
+    # trimesh cuts every vertex of an OBJ file to the shortest line.
+    if points.shape[1] != 3:
+        raise MeshError(f"{file}: a vertex has {points.shape[1]} coordinates; 3 are the rule: export the surface again")
     outside = np.flatnonzero(((faces < 0) | (faces >= len(points))).any(axis=1))
     if outside.size:
         raise MeshError(

@@ -146,3 +146,9 @@ def test_coordinates_whose_powers_overflow_are_refused():
     points = mesh.points * 1e150
     with pytest.raises(MeshError, match=r"tet 0 \(of \d+\) is degenerate: volume / longest edge\^3 = nan"):
         TetMesh(points, mesh.tets)
+
+
+def test_a_vertex_short_of_coordinates_is_refused(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 0.01\nv 0 0.01 0\nv 0 0 0.01\nf 1 2 3\nf 1 3 4\n")
+    with pytest.raises(MeshError, match="a vertex has 1 coordinates"):
+        read_surface(tmp_path / "a.obj", length_unit="m")

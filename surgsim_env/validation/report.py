@@ -1,6 +1,7 @@
 """The table on the terminal, `validation.md` and its plots, all from one run."""
 
 import math
+from collections import Counter
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -21,12 +22,16 @@ ERROR_TICKS = (0.03, 0.05, 0.1, 0.2, 0.5)
 COLOURS = {"met": "green", "not met": "red", "known": "yellow", "skipped": "dim"}
 INTRODUCTION = """# Validation
 
-Written by `surgsim validate{quick}` on {date} with {versions}; the plots are from the same
-run. References are closed forms, or solutions by scikit-fem on quadratic elements; none comes from the code under
-test. `known` marks a row that is not met and listed with its reason in `surgsim_env/validation/known_shortfalls.toml`.
-Organs are those of formula (6) of Sala et al. 2011 with the volume term where nu is above 1/4, unless a row says
-otherwise.
+{summary}.
+
+References are closed forms, or solutions by scikit-fem on quadratic elements; none comes from the code under test.
+`known` marks a row that is not met, with its reason. Organs have springs of formula (6) of Sala et al. 2011, and the
+volume term for nu above 1/4, unless a row says otherwise. Numbers in brackets refer to the [remarks](#remarks).
+
+Written by `surgsim validate{quick}` on {date} with {versions}.
 """
+# Shorter remarks are repeated in each row.
+SHORTEST_REMARK = 5  # words
 
 
 def verdict(validation: Validation, row: Row) -> str:
@@ -90,15 +95,19 @@ def print_report(validation: Validation, console: Console) -> None:
 def write_report(validation: Validation, folder: OutputFolder) -> None:
     """Write `validation.md` and images/validation_*.png into a folder."""
     introduction = INTRODUCTION.format(
+        summary=summary(validation),
         quick=" --quick" if validation.quick else "",
         date=datetime.now(UTC).date().isoformat(),
         versions=", ".join(f"{package} {version(package)}" for package in PACKAGES),
     )
-    lines = [introduction, summary(validation) + ".\n"]
-    lines += ["| " + " | ".join((*HEADINGS, "note")) + " |", "|" + "---|" * (len(HEADINGS) + 1)]
+    lines = [introduction, "| " + " | ".join((*HEADINGS, "note")) + " |", "|" + "---|" * (len(HEADINGS) + 1)]
+    shared = shared_remarks(validation)
     for row in validation.rows:
-        texts = (*cells(validation, row), validation.reason(row))
+        note = "; ".join(shared.get(remark, remark) for remark in validation.remarks(row))
+        texts = (*cells(validation, row), note)
         lines.append("| " + " | ".join(text.replace("|", "\\|") for text in texts) + " |")
+    if shared:
+        lines += ["\n## Remarks\n", *(f"* {number} {remark}" for remark, number in shared.items())]
     for figure in dict.fromkeys(curve.figure for curve in validation.curves):
         name = f"validation_{figure}.png"
         write_plot([curve for curve in validation.curves if curve.figure == figure], folder / f"images/{name}")
@@ -107,6 +116,13 @@ def write_report(validation: Validation, folder: OutputFolder) -> None:
         drawing.draw(folder / f"images/{drawing.name}.png")
         lines.append(f"\n{drawing.caption}\n\n![{drawing.name.replace('_', ' ')}](images/{drawing.name}.png)")
     (folder / REPORT_NAME).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def shared_remarks(validation: Validation) -> dict[str, str]:
+    """Numbers "(1)", "(2)", ... of the longer remarks on more than one row, in the order of the rows."""
+    count = Counter(remark for row in validation.rows for remark in validation.remarks(row))
+    shared = [remark for remark, rows in count.items() if rows > 1 and len(remark.split()) >= SHORTEST_REMARK]
+    return {remark: f"({number})" for number, remark in enumerate(shared, start=1)}
 
 
 def write_plot(curves: list[Curve], path: Path) -> None:

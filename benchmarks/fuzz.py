@@ -38,7 +38,7 @@ from numpy.random import Generator
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 # Packages whose errors are refusals.
-OURS = ("msdm_core", "surgsim_env")
+OURS = ("msdm_core", "surgsim_env", "surgsim_apps")
 SECONDS_MOST = 60.0  # for one input
 ADDRESS_SPACE = 16_000_000_000  # of the worker [bytes]: a table for an odd count is refused at once
 START_SECONDS = 600.0  # for the worker's start, which imports libraries
@@ -96,7 +96,7 @@ def mesh_cases(folder: Path) -> Iterator[Files]:
 
 def cells_of(size: float) -> Any:
     """Cells of one size [m]."""
-    from surgsim_env.patient.meshers import Cells
+    from surgsim_apps.patient.meshers import Cells
 
     return Cells(size, is_given=True, coarsening=1, fine_depth=0.0, approach=(0.0, 0.0, -1.0), face_angle_deg=60.0)
 
@@ -104,7 +104,7 @@ def cells_of(size: float) -> Any:
 def read_mesh_file(path: Path) -> object:
     from msdm_core.mesh_files.mesh_io import read_mesh
     from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
-    from surgsim_env.patient.meshers import mesh_surfaces, read_surfaces
+    from surgsim_apps.patient.meshers import mesh_surfaces, read_surfaces
 
     if path.suffix in SURFACE_SUFFIXES:
         return mesh_surfaces(read_surfaces([path], "m", mend=False), cells=cells_of(0.01), mesher="lattice")
@@ -149,8 +149,8 @@ def image_cases(folder: Path) -> Iterator[Files]:
 
 
 def read_image(path: Path) -> object:
-    from surgsim_env.patient.label_image import parse_labels, read_label_image
-    from surgsim_env.patient.meshers import mesh_image
+    from surgsim_apps.patient.label_image import parse_labels, read_label_image
+    from surgsim_apps.patient.meshers import mesh_image
 
     image = read_label_image(path, parse_labels("liver=1,lesion=2"))
     return mesh_image(image, path.name, cells=cells_of(0.012), mesher="lattice", mend=True)
@@ -179,7 +179,7 @@ def csv_cases(folder: Path) -> Iterator[Files]:
 
 
 def read_csv(path: Path) -> object:
-    from surgsim_env.haptics.trajectory import TrajectoryDevice
+    from surgsim_apps.haptics.trajectory import TrajectoryDevice
 
     return TrajectoryDevice.load(path).read()
 

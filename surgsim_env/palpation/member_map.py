@@ -24,13 +24,13 @@ from surgsim_env.palpation.chart import (
     press_sites,
     quickened,
 )
-from surgsim_env.reports.step_progress import StepProgress
 from surgsim_env.scene.anatomy import Anatomy, MemberName, load_anatomy
 from surgsim_env.scene.digest import content_digest
 from surgsim_env.scene.family import make_member
 from surgsim_env.scene.load import with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.motions import STILL, with_motion
+from surgsim_env.step_progress import StepProgress
 
 # Sites that are pressed, six times as many as float32 has lanes. On the 16 members of the validation split of
 # `liver_family`, pressed at every site, log k is then off by 0.017 (standard deviation) and by at most 0.15, the most

@@ -14,8 +14,8 @@ from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
-from surgsim_env.haptics.trajectory import TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
+from surgsim_env.scripting.motion_file import TIP, read_motion
 from surgsim_env.tasks.task import Task
 
 Action = NDArray[np.floating]

@@ -13,9 +13,9 @@ import pytest
 import trimesh
 
 import surgsim_env  # noqa: F401  (registers the environments)
-from surgsim_env.cli.main import main
+from surgsim_apps.arms.find_arm import find_arm, joint_inertia
+from surgsim_apps.cli.main import main
 from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.instruments.arm.find_arm import find_arm, joint_inertia
 from surgsim_env.instruments.arm.model import hold_joints, read_model
 from surgsim_env.instruments.arm.urdf import find_mesh
 from surgsim_env.scene.arm_description import AddedShape, LinkInertia, read_description

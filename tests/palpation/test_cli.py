@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.cli.main import main
-from surgsim_env.palpation.job import COLUMNS
+from surgsim_apps.cli.main import main
+from surgsim_apps.palpate.job import COLUMNS
 from surgsim_env.palpation.press import scan
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
@@ -93,7 +93,7 @@ def test_interrupt(monkeypatch, capsys):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("surgsim_env.cli.scenes.list_scenes", stop)
+    monkeypatch.setattr("surgsim_apps.cli.scenes.list_scenes", stop)
     assert main(["scenes"]) == 130
     assert capsys.readouterr().err == "surgsim: stopped\n"
 

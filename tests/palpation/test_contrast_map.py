@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from msdm_core.mesh.geodesic import SurfaceDistance
-from surgsim_env.coupling.sensors import ForceReading
-from surgsim_env.palpation.contrast_map import (
+from surgsim_apps.palpate.contrast_map import (
     contrast_with_model,
     contrast_with_neighbours,
     feel_lesions,
     healthy_majority,
     score_map,
 )
-from surgsim_env.palpation.truth import Truth
+from surgsim_apps.palpate.truth import Truth
+from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.scene.model import ForceSensor
 
 SPACING = 0.010

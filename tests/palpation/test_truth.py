@@ -8,7 +8,7 @@ import pytest
 from msdm_core.material.regions import Lesion, Material
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
-from surgsim_env.palpation.truth import felt_weights, is_pressable, seen_from_surface
+from surgsim_apps.palpate.truth import felt_weights, is_pressable, seen_from_surface
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import Anchor, Ball, Box

@@ -126,14 +126,10 @@ class Validation:
         """Whether every row is met, skipped or a known shortfall."""
         return not self.unexplained
 
-    def remarks(self, row: Row) -> list[str]:
-        """The reason of a known shortfall, and the parts of the row's note."""
-        known = [self.shortfalls[row.case].reason] if self.is_known(row) else []
-        return known + (row.note.split("; ") if row.note else [])
-
     def reason(self, row: Row) -> str:
-        """The row's remarks in one line."""
-        return "; ".join(self.remarks(row))
+        """The row's note, after the reason of its shortfall where it is a known one."""
+        known = self.shortfalls[row.case].reason if self.is_known(row) else ""
+        return "; ".join(part for part in (known, row.note) if part)
 
 
 def load_shortfalls() -> dict[str, Shortfall]:

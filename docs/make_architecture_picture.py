@@ -55,7 +55,7 @@ def draw_package(axes: Axes, package: str, left: float) -> float:
     axes.text(left + GAP, top + 1.3 * GAP, package, fontsize=12, weight="bold", color=INK)
     for room, lower_rooms in graph.items():
         implied = {below for lower in lower_rooms for below in reachable(graph, lower)}
-        for lower in lower_rooms - implied:
+        for lower in sorted(lower_rooms - implied):
             (x, y), (lower_x, lower_y) = place[room], place[lower]
             ends = (x, y), (lower_x, lower_y + HEIGHT)
             arrow = FancyArrowPatch(

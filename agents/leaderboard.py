@@ -9,7 +9,7 @@ from dataclasses import astuple
 from pathlib import Path
 
 from surgsim_apps.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
-from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.palpation import ScoreEstimate
 
 LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
 

@@ -29,7 +29,7 @@ from surgsim_apps.training.palpate_surrogate import PalpateSurrogate
 from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, save_policy
 from surgsim_apps.training.policy_network import NetworkLayout, actor_of
 from surgsim_apps.training.touch_features import TouchSummary
-from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+from surgsim_env import VectorEnvForStableBaselines
 
 ENVS, REPEAT = 16, 5
 # Of each periodic evaluation.

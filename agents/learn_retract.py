@@ -26,7 +26,7 @@ from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, Retra
 from surgsim_apps.training.fit import fit
 from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
-from surgsim_env.rendering.looks import draw_look, find_look_ranges
+from surgsim_env.rendering import draw_look, find_look_ranges
 
 ID = "SurgSim/Retract-v0"
 PICTURES: dict[str, Any] = {"obs_mode": "rgb_force", "looks": "train"}

@@ -46,8 +46,7 @@ from surgsim_apps.training.policy_files import (
 from surgsim_apps.training.recorded_faces import load_faces
 from surgsim_apps.training.site_agent import GrowingBelief, SiteProcess, observed_facts
 from surgsim_apps.training.site_surrogate import SiteSurrogate, SurrogateFace
-from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
+from surgsim_env.palpation import CUTOFF, ERROR_LINE, MAP_SIDE
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
 # From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.

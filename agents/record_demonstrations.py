@@ -37,12 +37,10 @@ from tqdm import tqdm
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_apps.scoring.episodes import EpisodeActor, agent_generator
 from surgsim_apps.scoring.evaluate import strangers_actor
-from surgsim_env.palpation.scores import EVALUATION_SEEDS
-from surgsim_env.rendering.gl import NoGLError
-from surgsim_env.rendering.options import CAMERAS
-from surgsim_env.scene.digest import PHYSICS_VERSION
-from surgsim_env.scripting import ScriptError, oracle_script, run_script
-from surgsim_env.scripting.observations import stacked_observations
+from surgsim_env.palpation import EVALUATION_SEEDS
+from surgsim_env.rendering import CAMERAS, NoGLError
+from surgsim_env.scene import PHYSICS_VERSION
+from surgsim_env.scripting import ScriptError, oracle_script, run_script, stacked_observations
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".json", ".safetensors")

@@ -77,9 +77,9 @@ def mesh_cases(folder: Path) -> Iterator[Files]:
     import meshio
     import trimesh
 
-    from msdm_core.mesh.tet_mesh import TetMesh
-    from msdm_core.mesh_files.mesh_io import write_mesh
-    from msdm_core.meshing.lattice_meshing import box_mesh
+    from msdm_core.mesh import TetMesh
+    from msdm_core.mesh_files import write_mesh
+    from msdm_core.meshing import box_mesh
 
     block = box_mesh((0.04, 0.03, 0.02), (4, 3, 2))
     region = (block.points[block.tets].mean(axis=1)[:, 0] > 0.02).astype(np.int32)
@@ -102,8 +102,7 @@ def cells_of(size: float) -> Any:
 
 
 def read_mesh_file(path: Path) -> object:
-    from msdm_core.mesh_files.mesh_io import read_mesh
-    from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
+    from msdm_core.mesh_files import SURFACE_SUFFIXES, read_mesh
     from surgsim_apps.patient.meshers import mesh_surfaces, read_surfaces
 
     if path.suffix in SURFACE_SUFFIXES:
@@ -112,15 +111,14 @@ def read_mesh_file(path: Path) -> object:
 
 
 def scene_cases(_folder: Path) -> Iterator[Files]:
-    from surgsim_env.scene.load import scenes_folder
+    from surgsim_env.scene import scenes_folder
 
     for name in ("phantom_small", "phantom", "lobe", "agarose_prism", "bovine_liver_block"):
         yield {f"{name}.toml": (scenes_folder() / "organs" / f"{name}.toml").read_bytes()}
 
 
 def read_scene(path: Path) -> object:
-    from surgsim_env.scene.anatomy import load_anatomy
-    from surgsim_env.scene.load import make_scene
+    from surgsim_env.scene import load_anatomy, make_scene
 
     anatomy = load_anatomy(make_scene(path))
     return anatomy.organ(anatomy.demonstration_lesions())
@@ -157,7 +155,7 @@ def read_image(path: Path) -> object:
 
 
 def arm_cases(_folder: Path) -> Iterator[Files]:
-    from surgsim_env.scene.load import scenes_folder
+    from surgsim_env.scene import scenes_folder
 
     instruments = scenes_folder() / "instruments"
     for name in ("psm_palpator", "psm_grasper", "psm_retractor", "six_axis"):
@@ -165,7 +163,7 @@ def arm_cases(_folder: Path) -> Iterator[Files]:
 
 
 def read_arm(path: Path) -> object:
-    from surgsim_env.instruments.arm.arm import load_arm
+    from surgsim_env.instruments import load_arm
 
     arm = load_arm(path)
     return arm.tip_pose(arm.home)

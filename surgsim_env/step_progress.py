@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
+__all__ = ["StepProgress"]
+
 # rich is imported where it is used: environments import this module, and rich takes a tenth of a second.
 if TYPE_CHECKING:
     from rich.console import Console

@@ -7,11 +7,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.arm.arm import Arm
-from surgsim_env.rendering.cameras import filling
-from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
-from surgsim_env.rendering.scene_model import shown_geoms
+from msdm_core.mesh import FloatArray
+from surgsim_env.instruments import Arm
+from surgsim_env.rendering import DrawnCapsule, draw_still, filling, shown_geoms
 
 SIZE, FIELD_OF_VIEW = (1600, 1200), 30.0
 # Share of the picture that the arm fills.

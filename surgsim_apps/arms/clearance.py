@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.arms.kinematics import BatchKinematics, Chain, cross, dot
 from surgsim_apps.arms.ports import Ports
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.arithmetic import cos, matmul, norm, sin, svd
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.survey import (
     SLIDE,
     SPHERE,
@@ -26,12 +26,8 @@ from surgsim_apps.arms.survey import (
     meeting_point,
     vector,
 )
-from surgsim_env.instruments.arm.arm import Arm
-from surgsim_env.instruments.arm.inverse_kinematics import PoseSolution, solve_pose
-from surgsim_env.instruments.arm.model import compile_arm, position_actuator
-from surgsim_env.scene.arm_description import AddedShape, ArmDescription, JointControl, Tip, Trocar
-from surgsim_env.scene.model import Port, Vector
-from surgsim_env.scene.palpable_surface import tangent_axes
+from surgsim_env.instruments import Arm, PoseSolution, compile_arm, position_actuator, solve_pose
+from surgsim_env.scene import AddedShape, ArmDescription, JointControl, Port, Tip, Trocar, Vector, tangent_axes
 
 # A palpator's dimensions [m]: an 8 mm shaft, a thinner neck behind the ball, whose radius a scene sets.
 SHAFT_RADIUS, NECK_RADIUS, NECK_LENGTH, BALL_RADIUS = 0.004, 0.003, 0.024, 0.005

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.kinematics import BatchKinematics, cross, dot
 
 ITERATIONS, POLISHING = 48, 8

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.instruments.arm.arm import Arm
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.instruments import Arm
 
 
 @dataclass(frozen=True)

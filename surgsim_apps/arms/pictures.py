@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.ports import Ports
 from surgsim_apps.arms.results import (
     QUANTITIES,
@@ -33,9 +33,8 @@ from surgsim_apps.reports.surface_drawing import (
     draw_patches,
     save_png,
 )
-from surgsim_env.instruments.arm.arm import Arm
-from surgsim_env.rendering.cameras import filling
-from surgsim_env.rendering.renderer import DrawnCapsule, draw_still
+from surgsim_env.instruments import Arm
+from surgsim_env.rendering import DrawnCapsule, draw_still, filling
 from surgsim_env.step_progress import StepProgress
 
 if TYPE_CHECKING:

@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.arm.arm_instrument import check_port_outside
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import fill, read_toml
-from surgsim_env.scene.model import Port
-from surgsim_env.scene.palpable_surface import tangent_axes
+from msdm_core.mesh import FloatArray
+from surgsim_env.instruments import check_port_outside
+from surgsim_env.scene import Anatomy, Port, fill, read_toml, tangent_axes
 
 Vector = tuple[float, float, float]
 # The camera's port lies 10 to 20 cm from the target, the instruments' 8 cm beside it (6 to 10 cm), all on a line across

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.arms.clearance import Obstacles, arm_distances
 from surgsim_apps.arms.joint_search import (
     REACHED,

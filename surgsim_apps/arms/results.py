@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.scene.model import Port
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.scene import Port
 
 SIDES = ("left", "right")
 # Reasons why an arm does not reach a point, in the order of the tests; 0 is reachable.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.pictures import ArmMaps, draw_arms, write_picture
@@ -41,12 +41,9 @@ from surgsim_apps.arms.results import (
 from surgsim_apps.arms.through_cycle import cycle_section, evaluate_cycle
 from surgsim_apps.reports.html_page import Picture, render_page
 from surgsim_apps.reports.output_folder import AnyFolder
-from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.rendering.gl import NoGLError
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.arm_description import ArmDescription
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import Scene
+from surgsim_env.instruments import load_arm
+from surgsim_env.rendering import NoGLError
+from surgsim_env.scene import Anatomy, ArmDescription, Scene, load_anatomy, make_scene
 from surgsim_env.step_progress import StepProgress
 
 # Places from which each point is chosen.

@@ -9,12 +9,17 @@ import mujoco
 import numpy as np
 
 from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
-from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.arm.model import read_model, read_xml
-from surgsim_env.instruments.arm.urdf import MESH_FORMATS, faulty_links, find_mesh, mesh_names, speed_limits
-from surgsim_env.scene.arm_description import LinkInertia
-from surgsim_env.scene.load import nearest
-from surgsim_env.scene.model import Vector
+from msdm_core.mesh import FloatArray
+from surgsim_env.instruments import (
+    MESH_FORMATS,
+    faulty_links,
+    find_mesh,
+    mesh_names,
+    read_model,
+    read_xml,
+    speed_limits,
+)
+from surgsim_env.scene import LinkInertia, Vector, nearest
 
 # Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.
 SHAPE_DENSITY, BARE_DENSITY = 1000.0, 2700.0

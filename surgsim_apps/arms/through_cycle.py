@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
 from surgsim_apps.arms.joint_search import Wanted, search_joints
 from surgsim_apps.arms.kinematics import BatchKinematics
@@ -32,8 +32,7 @@ from surgsim_apps.arms.results import (
     ThroughCycle,
     number_text,
 )
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.model import CyclicMotion
+from surgsim_env.scene import Anatomy, CyclicMotion
 from surgsim_env.step_progress import StepProgress
 
 # Evenly spaced positions between rest and top of the motion that moves the organ most.

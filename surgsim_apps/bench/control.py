@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from surgsim_apps.bench.measurement import Effort, interleaved, spread
 from surgsim_apps.bench.report import Figure, Section
-from surgsim_env.coupling.lane_group import core_count
+from surgsim_env.coupling import core_count
 
 SCENE = "phantom"
 ENV_ID = "SurgSim/Palpate-v0"

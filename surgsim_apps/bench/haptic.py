@@ -6,9 +6,8 @@ import numpy as np
 
 from surgsim_apps.bench.measurement import Effort
 from surgsim_apps.bench.report import Figure, Section
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_env.coupling import Simulation
+from surgsim_env.scene import load_anatomy, make_scene
 
 SPEED = 0.04  # [m/s]
 # Haptic steps held at depth after each press.

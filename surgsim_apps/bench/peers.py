@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.bench.measurement import Cells
 from surgsim_apps.bench.presses import (
     DENSITY,

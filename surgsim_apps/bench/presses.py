@@ -7,16 +7,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.kernels import OrganModel
 from surgsim_apps.bench.measurement import Cells
 from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh
 from surgsim_apps.validation.punch import DISC, modulus_field
 from surgsim_apps.validation.touch import FINE, NEAR
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import press
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import BlockMesh, MeshSource
+from surgsim_env.coupling import Simulation
+from surgsim_env.palpation import press
+from surgsim_env.scene import BlockMesh, MeshSource, load_anatomy, make_scene
 
 SIZE = (0.06, 0.06, 0.03)  # [m] of the block, x and y around 0, bottom at z = 0
 MODULUS, POISSON, DENSITY = 5000.0, 0.45, 1060.0

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.kernels.vector_kernels import GROUP, lane_counts, register_bits
+from msdm_core.kernels import GROUP, lane_counts, register_bits
 from surgsim_apps.reports.output_folder import OutputFolder
-from surgsim_env.coupling.lane_group import core_count
+from surgsim_env.coupling import core_count
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
 REPORT_NAME = "benchmarks.md"

@@ -8,15 +8,11 @@ from statistics import median
 import numpy as np
 
 from msdm_core.arithmetic import exp
-from msdm_core.kernels.structure_kernels import FAULT_NONE, LaneState, OrganModel, OrganState
-from msdm_core.kernels.substep_kernels import advance_substeps
-from msdm_core.kernels.vector_kernels import lane_counts
-from msdm_core.lanes.lanes import lane_responses, lanes_of, stack_organs, stack_shapes
-from msdm_core.material.regions import Damping, Material
-from msdm_core.material.tissue_law import Relaxation, Stiffening
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ
+from msdm_core.kernels import FAULT_NONE, LaneState, OrganModel, OrganState, advance_substeps, lane_counts
+from msdm_core.lanes import lane_responses, lanes_of, stack_organs, stack_shapes
+from msdm_core.material import Damping, Material, Relaxation, Stiffening
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import NO_CONTACT, NO_SHAPES, OrganSpec, advance_organ, compile_organ, rest_state
 from surgsim_apps.bench.measurement import Cells, Effort, exponent, interleaved, seconds_per_call, spread
 from surgsim_apps.bench.report import Figure, Section
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from surgsim_apps.bench.measurement import Effort, spread
 from surgsim_apps.bench.report import AbsentError, Figure, Section, absent
-from surgsim_env.coupling.lane_group import core_count
-from surgsim_env.rendering.gl import NoGLError
+from surgsim_env.coupling import core_count
+from surgsim_env.rendering import NoGLError
 
 LANES = 16
 # Of PPO: steps of each environment between updates are the effort's.
@@ -118,7 +118,7 @@ def learn(training: Training, effort: Effort) -> Clock:
     try:
         from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
-        from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
+        from surgsim_env import VectorEnvForStableBaselines
     except ImportError as missing:
         raise AbsentError(f"stable-baselines3 cannot be imported ({missing}): pip install 'surgsim[agents]'") from None
     envs = training.envs()

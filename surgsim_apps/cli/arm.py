@@ -15,7 +15,7 @@ from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.step_progress import StepProgress
 
 if TYPE_CHECKING:
-    from surgsim_env.instruments.arm.arm import Arm as ArmKinematics
+    from surgsim_env.instruments import Arm as ArmKinematics
 
 # Below this share of the places around home that the tip reaches, the arm is not useful as it is.
 REACH_LEAST = 0.5
@@ -91,9 +91,8 @@ class Arm:
             ValueError: a file that is no arm, or an option that is not possible.
         """
         from surgsim_apps.arms.find_arm import find_arm
-        from surgsim_env.instruments.arm.arm import load_arm
-        from surgsim_env.scene.model import require_number
-        from surgsim_env.scene.save import arm_toml
+        from surgsim_env.instruments import load_arm
+        from surgsim_env.scene import arm_toml, require_number
 
         if self.file.suffix.lower() == ".xacro":
             raise ValueError(f"{self.file} is a xacro file: expand it (xacro {self.file.name} > arm.urdf), check that")
@@ -147,7 +146,7 @@ def _draw(arm: ArmKinematics, path: Path, console: Console) -> bool:
     from matplotlib.image import imsave
 
     from surgsim_apps.arms.arm_picture import draw_arm
-    from surgsim_env.rendering.gl import NoGLError
+    from surgsim_env.rendering import NoGLError
 
     try:
         picture = draw_arm(arm, arm.home)

@@ -9,11 +9,16 @@ from rich.console import Console
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.study import RESULT_NAMES, ArmSetup, run_study
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.instruments.arm.arm import load_arm
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.arm_description import ArmDescription, read_description
-from surgsim_env.scene.load import make_scene, read_toml
-from surgsim_env.scene.motions import with_motion
+from surgsim_env.instruments import load_arm
+from surgsim_env.scene import (
+    Anatomy,
+    ArmDescription,
+    load_anatomy,
+    make_scene,
+    read_description,
+    read_toml,
+    with_motion,
+)
 
 FEWEST_POINTS = 10
 # A file of --compare with one of these tables is a ports file, any other an arm.

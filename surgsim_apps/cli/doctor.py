@@ -14,16 +14,13 @@ import numpy as np
 from packaging.requirements import Requirement
 from rich.console import Console
 
-from msdm_core.kernels.substep_kernels import advance_substeps
+from msdm_core.kernels import advance_substeps
 from msdm_core.numba_cache import FOLDER_PREFIX
 from surgsim_apps.bench.report import processor, registers
-from surgsim_env.coupling import mujoco_library
-from surgsim_env.coupling.lane_group import core_count
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import SitePress, press_alone, press_phases
+from surgsim_env.coupling import Simulation, core_count, mujoco_library
+from surgsim_env.palpation import SitePress, press_alone, press_phases
 from surgsim_env.rendering import gl
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene import load_anatomy, make_scene
 
 # What each extra of the package is for; `dev` is for its own tests.
 FEATURES = {

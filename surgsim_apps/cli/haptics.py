@@ -20,11 +20,9 @@ from surgsim_apps.haptics.settings import BREATH_BIT, HapticSettings
 from surgsim_apps.haptics.trajectory import TrajectoryDevice
 from surgsim_apps.haptics.udp import PORT, UdpDevice
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.arm.arm_instrument import parked_place
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene, pair_names
-from surgsim_env.scene.motions import list_motions, with_motion
+from surgsim_env.coupling import Simulation
+from surgsim_env.instruments import parked_place
+from surgsim_env.scene import list_motions, load_anatomy, make_scene, pair_names, with_motion
 
 TELEMETRY_NAME = "telemetry.csv"
 VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")

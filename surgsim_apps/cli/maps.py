@@ -4,10 +4,8 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
-from surgsim_env.palpation.member_map import member_map, still_template
-from surgsim_env.scene.anatomy import MemberName
-from surgsim_env.scene.family import family_of
-from surgsim_env.scene.load import make_scene
+from surgsim_env.palpation import member_map, still_template
+from surgsim_env.scene import MemberName, family_of, make_scene
 
 
 @dataclass(frozen=True)

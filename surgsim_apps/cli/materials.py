@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from msdm_core.material.regions import Material
+from msdm_core.material import Material
 from surgsim_apps.cli.values import MaybeText
-from surgsim_env.scene.load import list_materials, make_material
+from surgsim_env.scene import list_materials, make_material
 
 
 @dataclass(frozen=True)

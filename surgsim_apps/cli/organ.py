@@ -67,8 +67,7 @@ class Organ:
             MeshError: a file that cannot become an organ.
             ValueError: options that do not go together, or a place that cannot be written.
         """
-        from msdm_core.mesh_files.mesh_io import FORMATS
-        from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
+        from msdm_core.mesh_files import FORMATS, SURFACE_SUFFIXES
         from surgsim_apps.palpate.scene_options import SceneOptions
         from surgsim_apps.patient import make_patient as patient
         from surgsim_apps.patient.label_image import IMAGE_SUFFIXES, is_image

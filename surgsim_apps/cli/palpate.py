@@ -27,9 +27,7 @@ from surgsim_apps.palpate.job import (
 )
 from surgsim_apps.palpate.scene_options import SceneOptions, load_stable_anatomy, with_options
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.load import load_scene, make_scene
-from surgsim_env.scene.model import Ball, Vector
+from surgsim_env.scene import Anatomy, Ball, Vector, load_anatomy, load_scene, make_scene
 from surgsim_env.step_progress import StepProgress
 
 

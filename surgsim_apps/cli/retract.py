@@ -12,11 +12,9 @@ from rich.console import Console
 
 from surgsim_apps.cli.values import MaybeText
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.envs.surgical_env import SurgicalEnv
-from surgsim_env.rendering.gl import NoGLError
-from surgsim_env.scripting.oracle import oracle_script
-from surgsim_env.scripting.run import ScriptError, run_script
-from surgsim_env.scripting.trace import Trace
+from surgsim_env.envs import SurgicalEnv
+from surgsim_env.rendering import NoGLError
+from surgsim_env.scripting import ScriptError, Trace, oracle_script, run_script
 
 TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME = "trace.csv", "forces.png", "retraction.png", "summary.json"
 NAMES = (TRACE_NAME, PLOT_NAME, PICTURE_NAME, SUMMARY_NAME)

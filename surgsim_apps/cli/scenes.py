@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from surgsim_env.scene.load import list_scenes, make_scene
+from surgsim_env.scene import list_scenes, make_scene
 
 
 @dataclass(frozen=True)

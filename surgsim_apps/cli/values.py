@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from msdm_core.mesh_files.mesh_file import LengthUnit
+from msdm_core.mesh_files import LengthUnit
 
 # Optional values, shown in the help without tyro's "{None}|" and "(default: None)".
 MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]

@@ -8,8 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from surgsim_apps.cli.values import MaybeText, missing_packages
-from surgsim_env.scene.load import make_scene, with_instrument
-from surgsim_env.scene.motions import with_motion
+from surgsim_env.scene import make_scene, with_instrument, with_motion
 
 # The scene that has ports for two arms, and the two that work there.
 BIMANUAL_SCENE, BIMANUAL_INSTRUMENT = "lobe", "psm_pair"

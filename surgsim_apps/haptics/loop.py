@@ -7,16 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from msdm_core.organ.motion import SIGNAL
+from msdm_core.kernels import QUADRATURE_COUNT, OrganModel
+from msdm_core.mesh import FloatArray, IntArray
+from msdm_core.organ import SIGNAL
 from surgsim_apps.haptics.coupling import check_coupling, coupling_for
 from surgsim_apps.haptics.device import DevicePose, HapticDevice
 from surgsim_apps.haptics.settings import JAW_BIT, HapticSettings
 from surgsim_apps.haptics.tip_drive import TipDrive, tip_drives
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.arm.pair import SIDES, Pair
+from surgsim_env.coupling import Simulation
+from surgsim_env.instruments import SIDES, Pair
 
 # Poses farther from the device's origin are refused [m].
 REACH_LARGEST = 100.0

@@ -3,12 +3,9 @@
 import mujoco
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.coupling import TipDynamics
-from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
-from surgsim_env.instruments.arm.pair import SIDES, Pair
-from surgsim_env.instruments.arm.steering import SteeredArm
-from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments import SIDES, ArmInstrument, Instrument, Pair, SteeredArm
 
 # Mass [kg] and damping [N s/m] of the point that an arm follows: as heavy as a probe, and damped by more than the
 # energy that tissue of 100 N/m with a lag of 20 ms feeds in.

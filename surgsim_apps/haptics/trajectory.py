@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.haptics.device import DevicePose
-from surgsim_env.scripting.motion_file import read_motion
+from surgsim_env.scripting import read_motion
 
 # Tolerance of a row's time, as a share of the haptic step.
 ROUNDING = 1e-3

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.device import DeviceDynamics, DevicePose
 
 # UDP port of the simulation, in no list of IANA.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.identify.press_model import PressCurve, PressSetting, PressShape
 from surgsim_apps.identify.recordings import Recording, SitePress
 from surgsim_apps.identify.relaxation import Arms, HeldSamples, RelaxationFit, fit_relaxation, held_sites

@@ -10,14 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from msdm_core.kernels.structure_kernels import FAULT_NONE, ContactLaw, OrganModel
-from msdm_core.material.regions import Damping, Material
-from msdm_core.material.tissue_law import Stiffening
-from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.stability import contact_node_area, stable_dt
-from msdm_core.organ.stepping import advance_organ, describe_fault, round_shapes
+from msdm_core.kernels import FAULT_NONE, ContactLaw, OrganModel
+from msdm_core.material import Damping, Material, Stiffening
+from msdm_core.mesh import FloatArray
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import (
+    OrganSpec,
+    advance_organ,
+    compile_organ,
+    contact_node_area,
+    describe_fault,
+    rest_state,
+    round_shapes,
+    stable_dt,
+)
 
 # Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], which a static press does not feel.
 MODULUS, DENSITY = 1000.0, 1000.0

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 
 NEEDED = ("site", "depth_mm", "normal_force_n")
 PLACE = ("x_mm", "y_mm", "z_mm")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.identify.recordings import SitePress
 from surgsim_apps.identify.site_fit import SampledCurve
 

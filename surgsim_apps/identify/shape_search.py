@@ -15,10 +15,10 @@ from scipy.interpolate import RBFInterpolator
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.identify.press_model import PressCurve, PressSetting, PressShape, press_block
 from surgsim_apps.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites
-from surgsim_env.coupling.lane_group import core_count
+from surgsim_env.coupling import core_count
 
 # Ranges that are searched: thickness in radii of the ball, onset strain, cap strain less onset strain, tangent cap.
 THICKNESS_RADII = (1.2, 4.5)

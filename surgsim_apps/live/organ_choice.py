@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.regions import Lesion
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
-from surgsim_env.scene.model import Scene
+from msdm_core.kernels import OrganModel
+from msdm_core.material import Lesion
+from surgsim_env.scene import Anatomy, Scene, load_anatomy, with_added_mass
 
 SHOWN, HIDDEN, NONE = "as in the scene", "hidden", "none"
 

@@ -10,7 +10,7 @@ import numpy as np
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.pacing import timeliness
 from surgsim_apps.live.exchange_records import Change, LiveError, Pause, Phase, Record, Reset
 from surgsim_apps.live.guarded_server import GuardedServer

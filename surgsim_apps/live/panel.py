@@ -12,7 +12,7 @@ from surgsim_apps.haptics.pacing import Timeliness
 from surgsim_apps.live.exchange_records import Phase
 from surgsim_apps.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_apps.live.stage import COLOURS, CONTRASTS
-from surgsim_env.scene.model import Scene
+from surgsim_env.scene import Scene
 
 # Time span of the plots [s], and their number of points.
 PLOTTED, PLOT_POINTS = 10.0, 250

@@ -13,8 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.kernels import OrganModel
+from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.device import DevicePose
 from surgsim_apps.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_apps.haptics.pacing import Pacer, PaceSettings
@@ -32,14 +32,10 @@ from surgsim_apps.live.exchange_records import (
     Reset,
 )
 from surgsim_apps.live.organ_choice import OrganChoice, chosen_organ
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
-from surgsim_env.instruments.arm.pair import Pair
-from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
-from surgsim_env.rendering.scene_model import shown_geoms
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.model import Scene
+from surgsim_env.coupling import Simulation
+from surgsim_env.instruments import CONTACT_GROUP, ArmInstrument, Instrument, Pair
+from surgsim_env.rendering import shown_geoms
+from surgsim_env.scene import Anatomy, Scene, load_anatomy
 
 # Steps between frames for the page, and between checks of the parent process and of requests.
 FRAME_STEPS, LOOK_STEPS = 16, 8

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.scripting.motion_file import TIP, motion_columns
+from surgsim_env.scripting import TIP_PREFIX, motion_columns
 
 
 def columns(arm_count: int) -> list[str]:
@@ -15,7 +15,7 @@ def columns(arm_count: int) -> list[str]:
     names = ["time"]
     for mark in ("", "_2")[:arm_count]:
         names += motion_columns(mark)
-        names += [f"{what}{axis}{mark}" for what in (TIP, "force_") for axis in "xyz"]
+        names += [f"{what}{axis}{mark}" for what in (TIP_PREFIX, "force_") for axis in "xyz"]
     return names
 
 

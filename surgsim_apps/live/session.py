@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.pacing import PaceSettings
 from surgsim_apps.haptics.settings import BREATH_BIT
 from surgsim_apps.live.exchange_records import (
@@ -27,10 +27,9 @@ from surgsim_apps.live.exchange_records import (
 from surgsim_apps.live.messages import HandMotion
 from surgsim_apps.live.organ_choice import OrganChoice, lesion_kinds, live_scene
 from surgsim_apps.live.physics import home_of, run_physics
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.rendering.scene_model import shown_geoms
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.model import Scene
+from surgsim_env.coupling import Simulation
+from surgsim_env.rendering import shown_geoms
+from surgsim_env.scene import Scene, load_anatomy
 
 # Updates of the hands [1/s], and how long a key or stick counts as held after its last message [s].
 BEAT_RATE, HELD = 100.0, 0.15

@@ -9,14 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from msdm_core.material.regions import Lesion
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.palpation.touches import Indenter
-from surgsim_env.rendering.cameras import Camera, scene_cameras
-from surgsim_env.rendering.embedding import organ_surface
-from surgsim_env.rendering.scene_model import geom_colour, is_support, mesh_rows
-from surgsim_env.rendering.tissue import lesion_ball
-from surgsim_env.scene.anatomy import Anatomy
+from msdm_core.material import Lesion
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_env.palpation import Indenter
+from surgsim_env.rendering import Camera, geom_colour, is_support, lesion_ball, mesh_rows, organ_surface, scene_cameras
+from surgsim_env.scene import Anatomy
 
 # The page's scene is in decimetres: viser's cameras and handles are made for scenes of some metres.
 SCALE = 10.0

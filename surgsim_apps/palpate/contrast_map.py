@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from msdm_core.arithmetic import exp, log, lstsq, matmul, norm
-from msdm_core.mesh.geodesic import SurfaceDistance
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray, SurfaceDistance
 from surgsim_apps.palpate.truth import Truth
-from surgsim_env.palpation.lesion_estimator import strongest_apart
+from surgsim_env.palpation import strongest_apart
 
 # Rounds of reweighting: first Huber's weights, whose problem is convex, then Tukey's, which reject lesions.
 HUBER_ROUNDS = 8

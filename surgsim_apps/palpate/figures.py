@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.palpate.contrast_map import ContrastMap
 from surgsim_apps.palpate.job import MODEL, PalpationResult
 from surgsim_apps.palpate.truth import Truth
@@ -25,7 +25,7 @@ from surgsim_apps.reports.surface_drawing import (
     save_png,
     tube,
 )
-from surgsim_env.scene.palpable_surface import tangent_axes
+from surgsim_env.scene import tangent_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

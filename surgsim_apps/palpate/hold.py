@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.press import Press, scan
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.palpable_surface import hertz_force
+from msdm_core.mesh import FloatArray
+from surgsim_env.palpation import Press, scan
+from surgsim_env.scene import Anatomy, hertz_force
 
 # An organ sways where a node of its farther half moves by more than this share of the tip's depth.
 FAR_SHARE_LARGEST = 0.15

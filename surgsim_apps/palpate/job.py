@@ -17,8 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from msdm_core.arithmetic import cos, exp, matmul, norm, sin
-from msdm_core.material.regions import Lesion
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.material import Lesion
+from msdm_core.mesh import FloatArray
 from surgsim_apps.palpate.contrast_map import (
     ContrastMap,
     LesionScore,
@@ -30,11 +30,13 @@ from surgsim_apps.palpate.contrast_map import (
 from surgsim_apps.palpate.hold import Hold, hold_of
 from surgsim_apps.palpate.misses import Miss, explain_misses
 from surgsim_apps.palpate.truth import Truth, seen_from_surface
-from surgsim_env.coupling.sensors import ForceReading
-from surgsim_env.palpation.press import Press, scan
-from surgsim_env.scene.anatomy import SUPPORT_TIP_RADII, Anatomy
-from surgsim_env.scene.model import Ball, ForceSensor
-from surgsim_env.scene.palpable_surface import (
+from surgsim_env.coupling import ForceReading
+from surgsim_env.palpation import Press, scan
+from surgsim_env.scene import (
+    SUPPORT_TIP_RADII,
+    Anatomy,
+    Ball,
+    ForceSensor,
     PalpableFace,
     contact_radius,
     hidden_share,

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from msdm_core.arithmetic import arccos, matmul, norm
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.regions import Lesion
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.kernels import OrganModel
+from msdm_core.material import Lesion
+from msdm_core.mesh import FloatArray
 from surgsim_apps.palpate.contrast_map import ContrastMap, LesionScore, smoothed
 from surgsim_apps.palpate.truth import Truth, felt_weights, surface_points
-from surgsim_env.palpation.press import scan
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.model import Scene
+from surgsim_env.palpation import scan
+from surgsim_env.scene import Anatomy, Scene
 
 # A lesion is not under the pressed face where another point of the surface is pressed with so many times its strain.
 HIDDEN_RATIO = 2.0

@@ -4,10 +4,9 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.regions import Lesion
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass, with_substeps
-from surgsim_env.scene.model import Anchor, Scene, Side, Vector
+from msdm_core.kernels import OrganModel
+from msdm_core.material import Lesion
+from surgsim_env.scene import Anatomy, Anchor, Scene, Side, Vector, load_anatomy, with_added_mass, with_substeps
 
 PATTERN = "liver"
 # An organ lies in fat but for the side that faces the probe: E / h and E / 3h of 8 mm of it (chosen).

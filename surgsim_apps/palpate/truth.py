@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
-from msdm_core.material.regions import Lesion, lesion_extent
-from msdm_core.mesh.surface import node_normals, triangle_lattice
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.palpable_surface import contact_radius
+from msdm_core.material import Lesion, lesion_extent
+from msdm_core.mesh import FloatArray, IntArray, node_normals, triangle_lattice
+from surgsim_env.scene import Anatomy, contact_radius
 
 # Points of a lesion on a grid of so many along each of its axes, and points of a triangle by its split edges.
 GRID = 9

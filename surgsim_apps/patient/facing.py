@@ -3,12 +3,10 @@
 import numpy as np
 
 from msdm_core.arithmetic import cos, matmul, norm, sin
-from msdm_core.material.regions import Lesion, Material, lesion_extent
-from msdm_core.mesh.geodesic import NearestTriangle
-from msdm_core.mesh.surface import node_normals
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.material import Lesion, Material, lesion_extent
+from msdm_core.mesh import FloatArray, NearestTriangle, node_normals
 from surgsim_apps.patient.meshers import PatientMesh
-from surgsim_env.scene.model import Scene, Vector
+from surgsim_env.scene import Scene, Vector
 
 # Directions that are tried, spread evenly over the sphere (Fibonacci lattice): 9 degrees apart.
 DIRECTIONS = 500

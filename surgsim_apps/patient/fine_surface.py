@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import cos, dot, matmul, norm
-from msdm_core.mesh.carriers import find_carriers
-from msdm_core.mesh.surface import merge_vertices, surface_volume
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.meshing.segmentation_meshing import SmoothedShare
+from msdm_core.mesh import FloatArray, TetMesh, find_carriers, merge_vertices, surface_volume
+from msdm_core.meshing import SmoothedShare
 from surgsim_apps.patient.surface_files import Triangles, bodies_of
-from surgsim_env.rendering.surface import BEND, smooth_normals
-from surgsim_env.scene.model import FineSurface, MeshSource, TetFile
+from surgsim_env.rendering import BEND, smooth_normals
+from surgsim_env.scene import FineSurface, MeshSource, TetFile
 
 # Most triangles: a page in the browser then receives 240 kB for each picture.
 TRIANGLES_MOST = 40_000

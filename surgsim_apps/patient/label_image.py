@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from msdm_core.errors import MeshError
-from msdm_core.meshing.segmentation_meshing import largest_part, parts_of
+from msdm_core.meshing import largest_part, parts_of
 from surgsim_apps.patient.label_readers import ImageGeometry, LabelSource, read_labels
 from surgsim_apps.patient.materials import check_name, is_lesion
 

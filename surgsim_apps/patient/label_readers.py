@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from msdm_core.arithmetic import arccos, matmul, norm, svd
 from msdm_core.errors import MeshError
-from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.mesh_files.mesh_file import parsed
+from msdm_core.mesh import FloatArray
+from msdm_core.mesh_files import parsed
 
 # The axes of a scan's mesh, in words.
 CONVENTION = "x to the patient's left, y to the back, z to the head (LPS, as DICOM), metres, the scanner's own origin"

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from msdm_core.arithmetic import norm
-from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.levels import LESION_GAP, LEVELS, REFERENCE_TIP
-from surgsim_env.scene.model import LesionDraw
+from msdm_core.mesh import FloatArray
+from surgsim_env.scene import LESION_GAP, LEVELS, REFERENCE_TIP, Anatomy, LesionDraw
 
 # Points of the face that are tried.
 POINTS = 200

@@ -10,8 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from msdm_core.mesh_files.mesh_file import LengthUnit
-from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
+from msdm_core.mesh_files import SURFACE_SUFFIXES, LengthUnit
 from surgsim_apps.palpate.hold import SITES as HOLD_SITES
 from surgsim_apps.palpate.hold import check_hold
 from surgsim_apps.palpate.job import plan_sites
@@ -44,12 +43,16 @@ from surgsim_apps.patient.retract_scene import BED_GAP, BED_INSIDE, MODULUS_SPRE
 from surgsim_apps.patient.tet_files import PatientTets, patient_of_tets, read_tets, surfaces_of_tets
 from surgsim_apps.patient.touch import plan_text, plan_touch
 from surgsim_apps.reports.output_folder import OutputFolder, output_folder
-from surgsim_env.palpation.chart import healthy_file, write_healthy_map
-from surgsim_env.scene.anatomy import with_added_mass
-from surgsim_env.scene.load import load_scene, make_scene
-from surgsim_env.scene.model import Scene
-from surgsim_env.scene.palpable_surface import share_text, warn_of_coarse_cells
-from surgsim_env.scene.save import scene_toml
+from surgsim_env.palpation import healthy_file, write_healthy_map
+from surgsim_env.scene import (
+    Scene,
+    load_scene,
+    make_scene,
+    scene_toml,
+    share_text,
+    warn_of_coarse_cells,
+    with_added_mass,
+)
 from surgsim_env.step_progress import StepProgress
 
 MESHERS = ("lattice", "tetwild")
@@ -91,7 +94,7 @@ def make_patient(
         MeshError: a file that cannot become an organ.
         ValueError: arguments that do not go together, or values out of range.
     """
-    from msdm_core.mesh_files.mesh_io import FORMATS
+    from msdm_core.mesh_files import FORMATS
 
     if mesher not in MESHERS:
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
@@ -239,7 +242,7 @@ def _write_organ(
     found: PatientScene, files: OutputFolder, name: str, command: str, retraction: RetractScene | str | None
 ) -> list[str]:
     """Write all but the healthy map, by the name of the mesh; returns the names of the files."""
-    from msdm_core.mesh_files.mesh_io import write_mesh
+    from msdm_core.mesh_files import write_mesh
 
     scene_file = Path(name).with_suffix(".toml").name
     text = scene_text(found)
@@ -275,7 +278,7 @@ def _retract_file(out: Path) -> Path:
 
 def check_target(out: Path) -> None:
     """Refuse, before the work, a mesh file in an unknown format or below what is no folder."""
-    from msdm_core.mesh_files.mesh_io import WRITTEN_SUFFIX
+    from msdm_core.mesh_files import WRITTEN_SUFFIX
 
     if out.suffix.lower() != WRITTEN_SUFFIX:
         raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; meshes are written as {WRITTEN_SUFFIX}")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from msdm_core.errors import MeshError
-from msdm_core.material.regions import Material
+from msdm_core.material import Material
 
 # A common textbook value for soft organs [kg/m^3], not checked against a source.
 DENSITY = 1060.0

@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.errors import MeshError
-from msdm_core.mesh.quality import dihedral_angles
-from msdm_core.mesh.surface import check_surface, outward_facing, surface_volume
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.mesh_files.mesh_file import LengthUnit
-from msdm_core.meshing.lattice_meshing import largest_body_mesh, mesh_surface
-from msdm_core.meshing.segmentation_meshing import (
+from msdm_core.mesh import FloatArray, TetMesh, check_surface, dihedral_angles, outward_facing, surface_volume
+from msdm_core.mesh_files import LengthUnit
+from msdm_core.meshing import (
     FineFace,
     RegionShare,
     SmoothedShare,
     fill_labels,
     label_share,
+    largest_body_mesh,
     largest_part,
+    mesh_surface,
     smoothed_share,
     tag_tets,
     voxels_at,
@@ -43,7 +42,7 @@ from surgsim_apps.patient.surface_files import (
     region_name,
     voxels_inside,
 )
-from surgsim_env.scene.model import Vector
+from surgsim_env.scene import Vector
 
 # A default mesh with a smaller dihedral angle [degrees] is made again with cells scaled by the next share.
 DIHEDRAL_SMALLEST = 10.0

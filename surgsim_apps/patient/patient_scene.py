@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msdm_core.material.regions import Material
+from msdm_core.material import Material
 from surgsim_apps.palpate.hold import Hold
 from surgsim_apps.palpate.job import MODEL_MODULUS_ERROR, plan_sites
 from surgsim_apps.palpate.scene_options import (
@@ -23,17 +23,19 @@ from surgsim_apps.patient.materials import TissueMaterial, organ_material, regio
 from surgsim_apps.patient.meshers import PatientMesh
 from surgsim_apps.patient.supports import organ_anchors
 from surgsim_apps.patient.touch import DEPTH_STEP, TouchPlan
-from surgsim_env.scene.anatomy import Anatomy, anatomy_of, with_substeps
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import (
+from surgsim_env.scene import (
+    Anatomy,
     LesionDraw,
     Limits,
     PalpationSettings,
     Scene,
     TissueRegion,
     Vector,
+    anatomy_of,
+    hertz_force,
+    make_scene,
+    with_substeps,
 )
-from surgsim_env.scene.palpable_surface import hertz_force
 
 # As in the scene liver.
 SPACING_PER_TIP = 13.0 / 12.0

@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msdm_core.arithmetic import matmul
-from msdm_core.material.regions import Lesion, lesion_extent
-from msdm_core.mesh.quality import mesh_quality
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
-from msdm_core.organ.compile import compile_organ
-from msdm_core.organ.stability import stable_dt
+from msdm_core.material import Lesion, lesion_extent
+from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality
+from msdm_core.organ import compile_organ, stable_dt
 from surgsim_apps.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_apps.patient.patient_scene import PatientScene
 from surgsim_apps.patient.retract_scene import RetractScene, told
 from surgsim_apps.patient.supports import held_text
 from surgsim_apps.reports.html_page import Picture, render_page
 from surgsim_apps.reports.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
-from surgsim_env.rendering.tissue import cut_edges
-from surgsim_env.scene.palpable_surface import hertz_force, hidden_text, share_text
+from surgsim_env.rendering import cut_edges
+from surgsim_env.scene import hertz_force, hidden_text, share_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

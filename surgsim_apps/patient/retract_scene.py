@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from msdm_core.arithmetic import arctan2, cos, eigh, lstsq, matmul, norm, sin
-from msdm_core.mesh.ordering import in_sweep_order
-from msdm_core.mesh.quality import surface_cell
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.organ.support import Support
+from msdm_core.mesh import FloatArray, TetMesh, in_sweep_order, surface_cell
+from msdm_core.organ import Support
 from surgsim_apps.patient.fine_surface import mesh_source
 from surgsim_apps.patient.patient_scene import PatientScene
 from surgsim_apps.patient.surface_files import voxels_inside
-from surgsim_env.scene.anatomy import Anatomy, anatomy_of, with_substeps
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import (
+from surgsim_env.scene import (
+    Anatomy,
     Anchor,
     Box,
     Endoscope,
@@ -30,8 +27,11 @@ from surgsim_env.scene.model import (
     Retraction,
     Scene,
     Vector,
+    anatomy_of,
+    make_scene,
+    with_substeps,
 )
-from surgsim_env.tasks.visibility import Disc, uncovered
+from surgsim_env.tasks import Disc, uncovered
 
 # Opening and pad width of the grasper's jaw (scenes/instruments/grasper.xml), play that is left in the opening, and
 # least depth to which an edge is grasped [m].

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.mesh import FloatArray, TetMesh
 from surgsim_apps.palpate.scene_options import FAT_NAME, FAT_SOURCE, soft_bed
-from surgsim_env.scene.model import Anchor, Ball, Vector
+from surgsim_env.scene import Anchor, Ball, Vector
 
 # Stiffness of ligaments and of a hilum, per area [N/m^3]: chosen, four times that of fat: 1 mm under 1 kPa.
 LIGAMENT_STIFFNESS, LIGAMENT_SHEAR_STIFFNESS = 1.0e6, 3.3e5

@@ -10,9 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh.surface import check_surface, line_hits, merge_vertices, surface_volume
-from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.mesh_files.mesh_file import LengthUnit
+from msdm_core.mesh import FloatArray, check_surface, line_hits, merge_vertices, surface_volume
+from msdm_core.mesh_files import LengthUnit
 from surgsim_apps.patient.materials import check_name, is_lesion
 
 Triangles = NDArray[np.int64]
@@ -60,7 +59,7 @@ def read_organ_surface(
     Raises:
         MeshError: a surface that is open, crosses itself or is no manifold, unless `mend` is set.
     """
-    from msdm_core.mesh_files.surface_io import read_surface
+    from msdm_core.mesh_files import read_surface
 
     vertices, triangles = read_surface(file, length_unit=length_unit)
     bodies, name = bodies_of(vertices, triangles.astype(np.int64)), region_name(file)
@@ -86,7 +85,7 @@ def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list
     Raises:
         MeshError: a surface that is not closed, or several bodies of a region that is no lesion.
     """
-    from msdm_core.mesh_files.surface_io import read_surface
+    from msdm_core.mesh_files import read_surface
 
     vertices, triangles = read_surface(file, length_unit=length_unit)
     bodies = bodies_of(vertices, triangles.astype(np.int64))

@@ -7,16 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh.ordering import in_sweep_order
-from msdm_core.mesh.quality import surface_cell
-from msdm_core.mesh.surface import check_surface, merge_vertices, outward_facing
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray, TetMesh
-from msdm_core.mesh_files.mesh_file import LengthUnit
+from msdm_core.mesh import (
+    TET_FACES,
+    FloatArray,
+    IntArray,
+    TetMesh,
+    check_surface,
+    in_sweep_order,
+    merge_vertices,
+    outward_facing,
+    surface_cell,
+)
+from msdm_core.mesh_files import LengthUnit
 from surgsim_apps.patient.label_image import LabelName
 from surgsim_apps.patient.materials import is_lesion
 from surgsim_apps.patient.meshers import FILE_CONVENTION, PatientMesh, PatientSurfaces, region_volumes
 from surgsim_apps.patient.surface_files import ClosedSurface, Triangles, bodies_of, region_name
-from surgsim_env.scene.model import Vector
+from surgsim_env.scene import Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +69,7 @@ def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[Label
     Raises:
         MeshError: a file that is no organ, tags without names, names without tets.
     """
-    from msdm_core.mesh_files.mesh_io import read_mesh
+    from msdm_core.mesh_files import read_mesh
 
     mesh = read_mesh(file, length_unit=length_unit)
     there = np.unique(mesh.region).tolist()

@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass
 
 from msdm_core.arithmetic import cbrt, power
-from msdm_core.material.regions import Material
+from msdm_core.material import Material
 from surgsim_apps.palpate.scene_options import SceneOptions
-from surgsim_env.scene.model import Vector
-from surgsim_env.scene.palpable_surface import contact_radius
+from surgsim_env.scene import Vector, contact_radius
 
 # Radius of a tip [m] for organs up to these volumes [m^3]: a ball of 10 to 12 mm passes a trocar of 12 mm.
 TIPS = ((0.0005, 0.005), (math.inf, 0.006))

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from msdm_core.mesh.carriers import surface_carriers
-from msdm_core.mesh.surface import triangle_lattice
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.palpable_surface import tangent_axes
+from msdm_core.mesh import FloatArray, IntArray, surface_carriers, triangle_lattice
+from surgsim_env.scene import Anatomy, tangent_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,11 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation.press import HOLD_TIME, PRESS_SPEED
-from surgsim_env.palpation.scores import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
-from surgsim_env.scripting import ScriptError, oracle_script, run_script
-from surgsim_env.scripting.observations import selected_observations
-from surgsim_env.tasks.palpate_sites import SUCCESS_ERROR, PalpateSitesTask
+from surgsim_env.palpation import (
+    HOLD_TIME,
+    PRESS_SPEED,
+    MapScore,
+    PalpationRecord,
+    ScoreEstimate,
+    press_errors,
+    with_intervals,
+)
+from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
+from surgsim_env.tasks import SUCCESS_ERROR, PalpateSitesTask
 
 # Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
 AGENT_STREAM = 0x41_67_65_6E_74

@@ -48,9 +48,8 @@ from surgsim_apps.scoring.results import (
 )
 from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation.scores import PalpationRecord, press_errors, score, with_intervals
-from surgsim_env.scene.digest import PHYSICS_VERSION
-from surgsim_env.scene.load import agents_folder, list_scenes, make_scene
+from surgsim_env.palpation import PalpationRecord, press_errors, score, with_intervals
+from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
 from surgsim_env.step_progress import StepProgress
 
 # Seed of the bootstrap.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import norm
-from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.palpation import MAP_SIDE
 
 # Fewest rows, and largest distance between them [m].
 ROWS_FEWEST, ROW_SPACING = 5, 0.010

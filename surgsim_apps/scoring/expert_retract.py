@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import arctan2, norm
-from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks import RetractTask
 
 SPEED = 0.02  # [m/s] full scale of an action's velocity
 TURNING = 0.5  # [rad/s] full scale of the wrist

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from surgsim_apps.scoring.results import read_seeds
-from surgsim_env.palpation.scores import EVALUATION_SEEDS
+from surgsim_env.palpation import EVALUATION_SEEDS
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from surgsim_env.palpation.scores import ScoreEstimate
-from surgsim_env.scene.load import agents_folder
-from surgsim_env.scene.motions import STILL
+from surgsim_env.palpation import ScoreEstimate
+from surgsim_env.scene import STILL, agents_folder
 
 # JSON has no infinity.
 NEVER = "never"

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from surgsim_apps.training.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
-from surgsim_env.palpation.scores import MapScore
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.palpation import MapScore
+from surgsim_env.tasks import PalpateSitesTask
 
 # Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
 UCB_BETA = 3.0

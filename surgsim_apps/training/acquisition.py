@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from surgsim_apps.training.site_agent import SLICES, Belief, SiteProcess, observed_facts
-from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.palpation.lesion_estimator import EXCESS_SPREAD
+from surgsim_env.palpation import EXCESS_SPREAD, MAP_SIDE
 
 # Logit of a site over its worth.
 SHARPNESS = 6.0

@@ -6,8 +6,8 @@ import torch
 from torch import nn
 from torch.nn.functional import max_pool2d
 
-from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.tasks.palpate import PalpateTask
+from surgsim_env.palpation import MAP_SIDE
+from surgsim_env.tasks import PalpateTask
 
 # Channels of the observation.
 FACE = PalpateTask.channel_slices(

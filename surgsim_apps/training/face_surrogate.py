@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.palpation.touches import Indenter
+from surgsim_env.palpation import Indenter
 
 # Ranges that an episode draws: s, A, w over the lesion's radius, amplitude of g, and wavelength over the tip's radius.
 STIFFNESS, EXCESS, WIDTH, WAVE_MOST, WAVE_LENGTH = (1.2, 1.8), (0.35, 1.1), (0.6, 0.9), 0.12, (5.0, 15.0)

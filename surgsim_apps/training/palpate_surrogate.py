@@ -18,17 +18,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.palpation.touches import stiffest_spots
-from surgsim_env.tasks.palpate import (
+from surgsim_env.palpation import MAP_SIDE, stiffest_spots
+from surgsim_env.tasks import (
     DECLARE_STEPS,
     DECLARE_VALUE,
     EPISODE_STEPS,
+    SPEED_FULL_SCALE,
     START_GAP,
     PalpateTask,
     touch_memory,
 )
-from surgsim_env.tasks.task import SPEED_FULL_SCALE
 
 SCENE = "phantom_small"
 # The formula's numbers, fitted to the full physics at level "standard": c [N], p, the ranges of A and s [m], and of

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from surgsim_apps.training.acquisition import Acquisition
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
-from surgsim_env.envs.ids import TASKS
-from surgsim_env.scene.load import fill
-from surgsim_env.tasks.task import Task
+from surgsim_env.envs import TASKS
+from surgsim_env.scene import fill
+from surgsim_env.tasks import Task
 
 # Seed of sampled actions, with the environment's index, where no episode gives them random numbers.
 SAMPLING_SEED = 0

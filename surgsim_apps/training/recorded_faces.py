@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.training.site_surrogate import SurrogateFace
-from surgsim_env.coupling.sensors import ForceReading
-from surgsim_env.palpation.chart import MAP_SIDE, TouchMap, interpolated
-from surgsim_env.palpation.lesion_estimator import LESIONS_MOST, ORGAN_MAP_SPREAD, LesionEstimator
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.coupling import ForceReading
+from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, ORGAN_MAP_SPREAD, LesionEstimator, TouchMap, interpolated
+from surgsim_env.tasks import PalpateSitesTask
 
 # Episode k of a recording is reset with this seed plus k; the benchmark's evaluation seeds are others.
 FIRST_SEED = 6_000_000

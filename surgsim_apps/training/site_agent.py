@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul
-from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
-from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_SPREAD, contrast_process
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.palpation import BACKGROUND_SPREAD, EXCESS_SPREAD, MAP_SIDE, TouchMap, contrast_process
+from surgsim_env.tasks import PalpateSitesTask
 
 # Sites nearer to the chart's border than this share of its side are not pressed: half of the area that a press there
 # informs about can hold no lesion.

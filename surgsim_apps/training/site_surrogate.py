@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_apps.training.site_agent import OBSERVATION_SIZE, SLICES
-from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
-from surgsim_env.palpation.lesion_estimator import LesionEstimator
-from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
-from surgsim_env.scene.levels import REFERENCE_TIP
-from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
+from surgsim_env.palpation import FOUND_SHARE, MAP_SIDE, LesionEstimator, TouchMap, ospa, ospa_cutoff
+from surgsim_env.scene import REFERENCE_TIP
+from surgsim_env.tasks import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,9 +3,8 @@
 import torch
 from torch import nn
 
-from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE
-from surgsim_env.tasks.palpate import PalpateTask
-from surgsim_env.tasks.task import LENGTH_SCALE
+from surgsim_env.palpation import MAP_CELL, MAP_SIDE
+from surgsim_env.tasks import LENGTH_SCALE, PalpateTask
 
 # Radius of the blocks' tip [m].
 TIP_RADIUS = 0.008

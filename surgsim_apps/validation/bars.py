@@ -11,12 +11,11 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csr_array
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.fitting import spring_fit
-from msdm_core.material.regions import Damping, Material
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, compile_organ
+from msdm_core.kernels import OrganModel
+from msdm_core.material import Damping, Material, spring_fit
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, compile_organ
 from surgsim_apps.validation.dynamics import fitted_oscillation, released
 from surgsim_apps.validation.elements import cantilever, clamped_torsion
 from surgsim_apps.validation.row import Result, Row, compare, with_order

@@ -9,11 +9,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.sparse import block_diag, csr_array
 
-from msdm_core.material.regions import Capsule, Material, boundary_layer
-from msdm_core.material.stiffness import membrane_stiffness
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
-from msdm_core.meshing.lattice_meshing import box_mesh, mesh_surface
-from msdm_core.organ.compile import OrganSpec, compile_organ
+from msdm_core.material import Capsule, Material, boundary_layer, membrane_stiffness
+from msdm_core.mesh import FloatArray, IntArray, TetMesh
+from msdm_core.meshing import box_mesh, mesh_surface
+from msdm_core.organ import OrganSpec, compile_organ
 from surgsim_apps.validation.lattice import uniaxial_modulus
 from surgsim_apps.validation.row import Curve, Result, Row, compare
 from surgsim_apps.validation.statics import (
@@ -24,8 +23,7 @@ from surgsim_apps.validation.statics import (
     solve_displacement,
     vector_areas,
 )
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene import load_anatomy, make_scene
 
 MODULUS, THICKNESS = 1.0e6, 2.0e-5  # [Pa], [m]: those of the scene `liver`
 STIFFNESS = MODULUS * THICKNESS  # [N/m]

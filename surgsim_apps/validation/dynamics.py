@@ -14,20 +14,29 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import eigsh
 
 from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel, OrganState
-from msdm_core.material.regions import Capsule, Damping, Lesion, Material
-from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import contact_energy, kinetic_energy, potential_energy
-from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_or_raise, advance_organ, round_shapes
+from msdm_core.kernels import ContactLaw, OrganModel, OrganState
+from msdm_core.material import Capsule, Damping, Lesion, Material
+from msdm_core.mesh import FloatArray
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import (
+    NO_CONTACT,
+    NO_SHAPES,
+    OrganSpec,
+    advance_or_raise,
+    advance_organ,
+    compile_organ,
+    contact_energy,
+    kinetic_energy,
+    potential_energy,
+    rest_state,
+    round_shapes,
+    stable_dt,
+)
 from surgsim_apps.validation.row import Curve, Result, Row, compare
 from surgsim_apps.validation.statics import DENSITY, assemble_stiffness
-from surgsim_env.coupling.exchange import haptic_steps
-from surgsim_env.coupling.mujoco_library import runs_compiled
-from surgsim_env.instruments.tool_bodies import ToolBodies
-from surgsim_env.scene.model import substeps_needed
+from surgsim_env.coupling import haptic_steps, runs_compiled
+from surgsim_env.instruments import ToolBodies
+from surgsim_env.scene import substeps_needed
 
 SAMPLES = 400  # of a free motion
 STIFFER = 20e3  # [Pa] of the organs whose stable step is measured

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import eigsh, spsolve
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 from surgsim_apps.validation.statics import solve_displacement
 
 MISSING = "scikit-fem is not installed (pip install 'surgsim[dev]')"

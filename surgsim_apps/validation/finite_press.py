@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh import FloatArray
 
 # Pressure per penetration that stands for a rigid ball [N/m^3]: 5 kPa make 5 um.
 RIGID = 1e9

@@ -6,16 +6,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from msdm_core.arithmetic import matmul
-from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_WEIGHT
-from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.material.regions import Damping, Material
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import support_forces
-from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import advance, advance_or_raise, round_shapes
-from msdm_core.organ.support import Support, SupportLaw
+from msdm_core.kernels import (
+    QUADRATURE_BARYCENTRIC,
+    QUADRATURE_WEIGHT,
+    ContactLaw,
+    ContactShapes,
+    OrganModel,
+    OrganState,
+)
+from msdm_core.material import Damping, Material
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import (
+    OrganSpec,
+    Support,
+    SupportLaw,
+    advance,
+    advance_or_raise,
+    compile_organ,
+    rest_state,
+    round_shapes,
+    stable_dt,
+    support_forces,
+)
 from surgsim_apps.validation.row import Row, compare
 from surgsim_apps.validation.touch import BallOnOrgan, ball, block
 

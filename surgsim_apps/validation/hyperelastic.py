@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import spsolve
 
-from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
-from msdm_core.kernels.structure_kernels import OrganModel, OrganState
-from msdm_core.kernels.substep_kernels import evaluate_forces
-from msdm_core.material.continuum import STRAIN_LEAST
-from msdm_core.material.tissue_law import Stiffening
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.organ.compile import rest_state
-from msdm_core.organ.measure import node_strains
+from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
+from msdm_core.material import STRAIN_LEAST, Stiffening
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.organ import node_strains, rest_state
 from surgsim_apps.validation.elements import Cells, Size
 from surgsim_apps.validation.statics import averaged_gradient, block_sum, node_rows, volume_gradient
 

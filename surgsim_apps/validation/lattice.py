@@ -11,13 +11,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse import csr_array
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.lumping import lump_mass, voronoi_fractions
-from msdm_core.material.regions import Lesion, Material
-from msdm_core.material.stiffness import spring_network
-from msdm_core.mesh.quality import dihedral_angles
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.kernels import OrganModel
+from msdm_core.material import Lesion, Material, lump_mass, spring_network, voronoi_fractions
+from msdm_core.mesh import FloatArray, TetMesh, dihedral_angles
+from msdm_core.meshing import box_mesh
 from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
 from surgsim_apps.validation.statics import (
     DENSITY,
@@ -29,9 +26,7 @@ from surgsim_apps.validation.statics import (
     twice_energy,
     vector_areas,
 )
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import MeshSource
+from surgsim_env.scene import MeshSource, load_anatomy, make_scene
 
 MODULUS = 20e3  # [Pa]
 CELL = 0.01  # [m]

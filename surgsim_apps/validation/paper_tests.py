@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.material.regions import boundary_layer
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray
-from msdm_core.organ.compile import rest_state
-from msdm_core.organ.stepping import advance_or_raise
+from msdm_core.material import boundary_layer
+from msdm_core.mesh import TET_FACES, FloatArray, IntArray
+from msdm_core.organ import advance_or_raise, rest_state
 from surgsim_apps.reports.surface_drawing import OrthographicView
 from surgsim_apps.validation.bars import prism, torsion_stiffness
 from surgsim_apps.validation.row import Drawing, Result, compare
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import press
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_env.coupling import Simulation
+from surgsim_env.palpation import press
+from surgsim_env.scene import Anatomy, load_anatomy, make_scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.material.regions import Lesion, Material
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
-from msdm_core.meshing.lattice_meshing import box_mesh
+from msdm_core.material import Lesion, Material
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.meshing import box_mesh
 from surgsim_apps.validation.elements import Elements, layer, punch_stiffness
 from surgsim_apps.validation.row import Curve, Result, Row, compare
 from surgsim_apps.validation.statics import (

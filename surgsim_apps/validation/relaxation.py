@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.sparse import csc_array
 
-from msdm_core.material.tissue_law import Relaxation
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.material import Relaxation
+from msdm_core.mesh import FloatArray
 
 
 def spring_creep(arms: Relaxation, time: FloatArray) -> FloatArray:

@@ -5,10 +5,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.material.regions import Damping, Lesion, Material
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
-from msdm_core.organ.compile import OrganSpec, compile_organ
+from msdm_core.kernels import OrganModel
+from msdm_core.material import Damping, Lesion, Material
+from msdm_core.mesh import TET_FACES, FloatArray, TetMesh
+from msdm_core.organ import OrganSpec, compile_organ
 
 DENSITY = 1060.0  # [kg/m^3]
 RESIDUAL = 1e-8  # of the linear solution, relative; energies are then right to its square

@@ -11,9 +11,13 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csc_array
 
-from msdm_core.kernels.structure_kernels import OrganModel, OrganState
-from msdm_core.material.continuum import (
+from msdm_core.kernels import OrganModel, OrganState
+from msdm_core.material import (
+    Damping,
+    Material,
+    Relaxation,
     SpringSolid,
+    Stiffening,
     bar_gradient,
     lattice_directions,
     simple_shear_stress,
@@ -21,11 +25,8 @@ from msdm_core.material.continuum import (
     stretch_across,
     uniaxial_stress,
 )
-from msdm_core.material.regions import Damping, Material
-from msdm_core.material.tissue_law import Relaxation, Stiffening
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, rest_state
-from msdm_core.organ.stepping import advance_or_raise
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, advance_or_raise, blank_state, compile_organ, rest_state
 from surgsim_apps.validation.elements import BallContact
 from surgsim_apps.validation.hyperelastic import OrganBlock, Plates, QuadraticBlock, Test, solved
 from surgsim_apps.validation.punch import reference_layer
@@ -33,8 +34,7 @@ from surgsim_apps.validation.relaxation import ViscoelasticBody, spring_creep
 from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
 from surgsim_apps.validation.statics import DENSITY, assemble_stiffness, nodal_dofs
 from surgsim_apps.validation.touch import PRESS_SPEED, STEP, BallOnOrgan, ball, phantom
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene import load_anatomy, make_scene
 
 MODULUS = 5e3  # [Pa]
 RATIO = 0.45

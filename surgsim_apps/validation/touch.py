@@ -13,23 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msdm_core.errors import OrganDivergedError
-from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
-from msdm_core.material.regions import Damping, Lesion
-from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.measure import tissue_load
-from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import advance_or_raise, round_shapes
+from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
+from msdm_core.material import Damping, Lesion
+from msdm_core.mesh import FloatArray
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, advance_or_raise, compile_organ, rest_state, round_shapes, stable_dt, tissue_load
 from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh
 from surgsim_apps.validation.punch import DISC, SIZE, Hidden, modulus_field
 from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import press
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import BlockMesh, MeshSource, Scene
-from surgsim_env.scene.palpable_surface import hidden_share
+from surgsim_env.coupling import Simulation
+from surgsim_env.palpation import press
+from surgsim_env.scene import BlockMesh, MeshSource, Scene, hidden_share, load_anatomy, make_scene
 
 REFERENCE = "scikit-fem, axisymmetric, neo-Hookean, rigid tip"
 # Of the instrument's press: tolerances, and sites within a cell of the middle, in cells, so that the mean is over the

@@ -15,7 +15,7 @@ from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import SitePress, in_threads, press_in_lanes, press_phases
+from surgsim_env.palpation.site_press import SitePress, in_threads, press_in_lanes, press_phases
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass, with_substeps
 from surgsim_env.scene.digest import PHYSICS_VERSION, content_digest
 from surgsim_env.scene.family import KEPT_MOST

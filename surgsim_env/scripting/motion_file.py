@@ -12,7 +12,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 # Of a pose: 31 bits, so that they fit into any integer type.
 BUTTONS_LARGEST = 2**31 - 1
 # Names of the columns with the tip's place [m], which recordings of `surgsim view` have.
-TIP = "tip_"
+TIP_PREFIX = "tip_"
 
 
 class Motion(NamedTuple):
@@ -52,7 +52,7 @@ def read_motion(path: Path, mark: str = "", *, of_tip: bool = False) -> Motion:
         try:
             names = reader.fieldnames or []
             *places, pressed = motion_columns(mark)
-            columns = ["time", *(f"{TIP if of_tip else ''}{name}" for name in places)]
+            columns = ["time", *(f"{TIP_PREFIX if of_tip else ''}{name}" for name in places)]
             missing = [name for name in columns if name not in names]
             if missing:
                 raise ValueError(

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import LinearOperator, cg, spilu
 
 from surgsim_apps.palpate.job import plan_sites
 from surgsim_apps.palpate.scene_options import soft_bed
-from surgsim_env.palpation.press import scan
+from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.load import make_material, make_scene
 from tests.patient.organs import kidney

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from msdm_core.meshing.lattice_meshing import box_mesh
+from surgsim_apps.palpate import misses
 from surgsim_apps.palpate.contrast_map import Estimate, score_map
 from surgsim_apps.palpate.misses import (
     NEAR_SUPPORT,
@@ -18,7 +19,6 @@ from surgsim_apps.palpate.misses import (
     explain_misses,
 )
 from surgsim_apps.palpate.truth import seen_from_surface
-from surgsim_env.palpation import misses
 from surgsim_env.scene.anatomy import anatomy_of
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import Anchor, Ball, Box

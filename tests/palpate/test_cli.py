@@ -9,7 +9,7 @@ from matplotlib.image import imread
 
 from surgsim_apps.cli.main import main
 from surgsim_apps.palpate.job import COLUMNS
-from surgsim_env.palpation.press import scan
+from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
@@ -99,7 +99,7 @@ def test_interrupt(monkeypatch, capsys):
 
 
 def test_an_interrupt_during_a_scan_ends_after_the_press_at_hand(monkeypatch):
-    monkeypatch.setattr("surgsim_env.palpation.press.core_count", lambda: 2)
+    monkeypatch.setattr("surgsim_env.palpation.site_press.core_count", lambda: 2)
     anatomy = load_anatomy(make_scene("phantom"))
     sites, normals = anatomy.face.raster(0.01)
     pressed = []

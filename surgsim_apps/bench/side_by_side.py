@@ -15,14 +15,14 @@ SHARE = 0.02
 # A round that takes longer than this [s] is not repeated.
 LONGEST_ROUND = 60.0
 NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that is stable in the press is used
-METHOD = """One press of a frictionless ball of 8 mm radius, 4 mm deep at 40 mm/s, then 0.1 s of rest, on a block of 60 x 60 x 30 mm,
-E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each round. `wall` and
-`processor` are seconds per simulated second (1 is real time), medians; `ratio` is processor time relative to surgsim. A
-round that takes more than a minute is not repeated. Force is the mean of two places, over a node in the block's middle and
-half a cell to the side; `error` is relative to axisymmetric quadratic finite elements with small strains:
-{references}. surgsim has friction 0.2, which hardly affects a straight press, and its instrument in MuJoCo, and reads the
-force in every haptic step, the others once, at the end. They have nodes on a cubic or nearly cubic grid, surgsim on a
-body-centred lattice: numbers of nodes are similar, positions differ."""
+METHOD = """One press of a frictionless ball of 8 mm radius, 4 mm deep at 40 mm/s, then 0.1 s of rest, on a block of 60
+x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
+round. `wall` and `processor` are seconds per simulated second (1 is real time), medians; `ratio` is processor time
+relative to surgsim. A round that takes more than a minute is not repeated. Force is the mean of two places, over a
+node in the block's middle and half a cell to the side; `error` is relative to axisymmetric quadratic finite elements
+with small strains: {references}. surgsim has friction 0.2, which hardly affects a straight press, and its instrument
+in MuJoCo, and reads the force in every haptic step, the others once, at the end. They have nodes on a cubic or nearly
+cubic grid, surgsim on a body-centred lattice: numbers of nodes are similar, positions differ."""
 WALL, PROCESSOR, RATIO = ("wall", "s/s"), ("processor", "s/s"), ("ratio to surgsim", "1")
 FORCE, ERROR = ("force", "N"), ("error", "%")
 

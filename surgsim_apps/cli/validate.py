@@ -18,7 +18,7 @@ class Validate:
     quick: bool = False
     """Only the cases that take seconds."""
     out: MaybePath = None
-    """Folder for validation.md, validation.csv and images/. Default: docs/ of a checkout; runs/validation elsewhere or with --quick."""
+    """Folder for validation.md, .csv and images/. Default: docs/ of a checkout; else, or --quick, runs/validation."""
 
     def run(self, console: Console) -> int:
         """Run the cases, print and write the report; returns the exit status.

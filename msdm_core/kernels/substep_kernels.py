@@ -13,6 +13,21 @@ from numba import njit
 from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
+from msdm_core.kernels.lane_view_kernels import (
+    SpringLaw,
+    column_of,
+    entry_of,
+    ground_of,
+    lanes_of,
+    nodes_of,
+    part_of,
+    response_of,
+    set_entry,
+    shapes_of,
+    supports_of,
+    surface_of,
+    touched_of,
+)
 from msdm_core.kernels.layout_kernels import load_part, store_part
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
@@ -21,19 +36,6 @@ from msdm_core.kernels.structure_kernels import (
     FAULT_INVERTED_TET,
     FAULT_NONE,
     FAULT_NOT_FINITE,
-    SpringLaw,
-    column_of,
-    entry_of,
-    ground_of,
-    in_rows,
-    lanes_of,
-    part_of,
-    response_of,
-    set_entry,
-    shapes_of,
-    supports_of,
-    surface_of,
-    touched_of,
 )
 from msdm_core.kernels.support_kernels import (
     add_foundation_forces,
@@ -152,7 +154,8 @@ def _evaluate(model, state, fades, fade_duration):
             faded_share(fade_duration, time[2]),
         )  # fmt: skip
     lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
-    position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
+    position, velocity, force = nodes_of(lanes, state)
+    tension = state.node_tension
     averages, stiffens = _averages(lanes, model.averages_volume), model.stiffens
     pairs, lengths = state.node_pairs, state.spring_lengths
     if stiffens:
@@ -355,8 +358,9 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         if steep_count == 0:
             _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
     if steep_count > 0 and moving > 0:
+        position, velocity, force = nodes_of(lanes, state)
         hold_steep(
-            lanes, state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass,
+            lanes, position, velocity, force, model.node_inverse_mass,
             model.spring_nodes, model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes,
             model.tet_nodes.shape[0], state.steep_springs, steep_count, group_width(lanes),
             SWEEPS_LEAST, model.steep_sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
@@ -372,7 +376,8 @@ def _move_ground(lanes, model, state, dt, decay):
     """Move what holds the organs that move: anchored nodes by the integration that follows, the others at once."""
     if model.motion_node_shift.shape[0] == 0:
         return
-    drag_along(lanes, model.motion_node_shift, state.ground_rate, state.moving, decay, state.node_velocity)
+    _, velocity, _ = nodes_of(lanes, state)
+    drag_along(lanes, model.motion_node_shift, state.ground_rate, state.moving, decay, velocity)
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
             continue
@@ -433,28 +438,29 @@ def advance_inside(model, state, shapes, law, response, dt, decay, substep_count
     wrench[:] = 0.0
     _wake(lanes, state)
     _load_rows(lanes, state)
-    rows = in_rows(lanes, state)
-    _begin(lanes, model, rows, shapes, response, dt * substep_count)
+    position, velocity, force = nodes_of(lanes, state)
+    _begin(lanes, model, state, shapes, response, dt * substep_count)
     fade_every = max(1, int(FADE_INTERVAL / dt + 0.5))
     faded = 0
     for substep in range(substep_count):
         fades = model.relaxes and (substep + 1 == substep_count or substep + 1 - faded == fade_every)
-        squeezed_count, steep_count = _evaluate(model, rows, fades, (substep + 1 - faded) * dt)
+        squeezed_count, steep_count = _evaluate(model, state, fades, (substep + 1 - faded) * dt)
         if fades:
             faded = substep + 1
         if (
-            _touch(lanes, model, rows, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench)
+            _touch(
+                lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench
+            )
             == 0
         ):
             break
-        _move_ground(lanes, model, rows, dt, decay)
+        _move_ground(lanes, model, state, dt, decay)
         integrate(
-            lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,
-            rows.moving, rows.finite_sum,
+            lanes, position, velocity, force, model.node_inverse_mass, dt, decay, state.moving, state.finite_sum
         )  # fmt: skip
-        if _move_tools(lanes, rows, shapes, response, dt, substep, wrench) == 0:
+        if _move_tools(lanes, state, shapes, response, dt, substep, wrench) == 0:
             break
-    _end(lanes, model, rows, shapes, law, response, substep_count, wrench)
+    _end(lanes, model, state, shapes, law, response, substep_count, wrench)
     _store_motion(lanes, state)
     _store_force(lanes, state)
     return state.lane_fault[0]
@@ -484,5 +490,5 @@ def evaluate_forces(model, state):
     """
     lanes = lanes_of(model)
     _load_rows(lanes, state)
-    _evaluate(model, in_rows(lanes, state), False, 0.0)
+    _evaluate(model, state, False, 0.0)
     _store_force(lanes, state)

@@ -24,7 +24,8 @@ from msdm_core.material.continuum import (
 from msdm_core.material.regions import Damping, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, rest_state
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import advance_or_raise
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene

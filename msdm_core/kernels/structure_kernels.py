@@ -42,7 +42,7 @@ class Field(NamedTuple):
     Fields:
         name: in `OrganModel` or `OrganState`
         unit: SI, "" for pure numbers, flags and indices
-        shape: lengths in an organ alone, by number or by name: "n_node 3"; "" for a scalar
+        shape: lengths in an organ alone, by number or by name; () for a scalar
         lanes: one of LAYOUTS
         meaning: for the documentation
         dtype: in an organ alone
@@ -50,114 +50,122 @@ class Field(NamedTuple):
 
     name: str
     unit: str
-    shape: str
+    shape: tuple[int | str, ...]
     lanes: str
     meaning: str
-    dtype: str = "float64"
+    dtype: str
 
-    def lengths(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
+    def lengths(self, sizes: Mapping[int | str, int]) -> tuple[Any, ...]:
         """The shape in an organ alone, from lengths by name."""
-        return tuple(int(length) if length.isdigit() else sizes[length] for length in self.shape.split())
+        return tuple([sizes.get(length, length) for length in self.shape])
+
+
+def _field(name: str, unit: str, shape: str, lanes: str, meaning: str, dtype: str = "float64") -> Field:
+    """A field whose lengths are written as "n_node 3"."""
+    lengths = tuple(int(length) if length.isdigit() else length for length in shape.split())
+    return Field(name, unit, lengths, lanes, meaning, dtype)
 
 
 # Lengths: n_soft is n_node, n_steep n_spring and n_relaxing n_spring, or 0 if no spring stiffens or relaxes; n_arm is
 # 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.compile.state_sizes`.
 MODEL_FIELDS = (
-    Field("node_rest_position", "m", "n_node 3", "first", "undeformed position"),
-    Field("node_mass", "kg", "n_node", "own", "lumped mass"),
-    Field("node_inverse_mass", "1/kg", "n_node", "own", "1 / mass, 0 where the node is anchored"),
-    Field("spring_nodes", "", "n_spring 2", "shared", "both ends; spring t is tet t's first edge", "int32"),
-    Field("spring_stiffness", "N/m", "n_spring", "own", "k"),
-    Field("spring_rest_length", "m", "n_spring", "rest", "l0"),
-    Field("stiffens", "", "", "shared", "whether any spring stiffens with strain", "bool"),
-    Field("node_softness", "1/J", "n_soft", "own", "5 / sum of k l0^2 over the springs of a node"),
-    Field("node_onset", "", "n_soft", "shared", "e0 of its `Stiffening`"),
-    Field("node_growth", "", "n_soft", "shared", "1 / (e1 - e0)"),
-    Field("node_excess", "", "n_soft", "shared", "(c - 1) (e1 - e0)"),
-    Field("steep_rise", "", "", "shared", "least rise of a spring with a steepness of STEEP_EXCESS"),
-    Field("steep_sweeps", "", "", "shared", "most sweeps of `hold_steep`", "int64"),
-    Field("relaxes", "", "", "shared", "whether any spring has Maxwell arms", "bool"),
-    Field("spring_gain", "", "n_relaxing", "shared", "tension at once over that at equilibrium, 1 + sum g_i"),
-    Field("spring_arm_modulus", "", "n_arm", "shared", "g_i, arm by arm"),
-    Field("arm_time", "s", "3", "shared", "tau_i of all springs, inf for an arm that is not used"),
-    Field("tet_nodes", "", "n_tet 4", "shared", "corners of each tet", "int32"),
-    Field("tet_rest_volume", "m^3", "n_tet", "alone", "V0"),
-    Field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
-    Field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
-    Field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
-    Field("node_rest_volume", "m^3", "n_node", "alone", "volume averaged at a node, a quarter of its tets"),
-    Field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
-    Field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
-    Field("averages_volume", "", "", "own", "whether any node_bulk is above 0", "bool"),
-    Field("surface_triangles", "", "n_surface 3", "rows", "triangles an instrument may touch, outward", "int32"),
-    Field("surface_rest_area", "m^2", "n_surface", "rows", ""),
-    Field("support_kind", "", "n_support", "shared", "the solids it rests on, PLANE, SPHERE, ...", "int32"),
-    Field("support_position", "m", "n_support 3", "shared", "middle of each, or a plane's point"),
-    Field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world, one a column"),
-    Field("support_size", "m", "n_support 3", "shared", "radius, half length, half sizes"),
-    Field("support_friction", "", "n_support", "shared", "Coulomb coefficient"),
-    Field("support_nodes", "", "n_support_node", "rows", "free nodes of the surface, which supports may hold", "int32"),
-    Field("support_area", "m^2", "n_support_node", "rows", "surface area that belongs to each of them"),
-    Field("support_stiffness", "N/m^3", "", "shared", "pressure per penetration"),
-    Field("support_damping", "N s/m^3", "", "shared", "pressure per closing speed"),
-    Field("support_tangential_stiffness", "N/m^3", "", "shared", "traction per stretch while sticking"),
-    Field("foundation_nodes", "", "n_held", "shared", "nodes that elastic foundations hold", "int32"),
-    Field("foundation_position", "m", "n_held 3", "rows", "where those nodes are without force"),
-    Field("foundation_stiffness", "N/m", "n_held 3 3", "rows", "force per displacement, all foundations together"),
-    Field("motion_node_shift", "m", "n_motion n_node 4", "rest", "way of the ground per unit of a signal, and 0"),
-    Field("motion_anchored_nodes", "", "n_anchored", "rows", "anchored nodes of an organ whose ground moves", "int64"),
-    Field("motion_foundation_shift", "m", "n_motion n_held 3", "rows", "likewise at the nodes of foundations"),
-    Field("motion_support_shift", "m", "n_motion n_support 3", "shared", "likewise of supports"),
-    Field("gravity", "m/s^2", "3", "shared", ""),
-    Field("alpha", "1/s", "", "shared", "mass-proportional damping rate"),
-    Field("beta", "s", "", "shared", "stiffness-proportional damping time"),
-    Field("stable_step", "s", "", "own", "largest stable step without contact of instruments"),
-    Field("added_mass", "kg", "", "alone", "part of node_mass that `stability.scale_mass` added"),
+    _field("node_rest_position", "m", "n_node 3", "first", "undeformed position"),
+    _field("node_mass", "kg", "n_node", "own", "lumped mass"),
+    _field("node_inverse_mass", "1/kg", "n_node", "own", "1 / mass, 0 where the node is anchored"),
+    _field("spring_nodes", "", "n_spring 2", "shared", "both ends; spring t is tet t's first edge", "int32"),
+    _field("spring_stiffness", "N/m", "n_spring", "own", "k"),
+    _field("spring_rest_length", "m", "n_spring", "rest", "l0"),
+    _field("stiffens", "", "", "shared", "whether any spring stiffens with strain", "bool"),
+    _field("node_softness", "1/J", "n_soft", "own", "5 / sum of k l0^2 over the springs of a node"),
+    _field("node_onset", "", "n_soft", "shared", "e0 of its `Stiffening`"),
+    _field("node_growth", "", "n_soft", "shared", "1 / (e1 - e0)"),
+    _field("node_excess", "", "n_soft", "shared", "(c - 1) (e1 - e0)"),
+    _field("steep_rise", "", "", "shared", "least rise of a spring with a steepness of STEEP_EXCESS"),
+    _field("steep_sweeps", "", "", "shared", "most sweeps of `hold_steep`", "int64"),
+    _field("relaxes", "", "", "shared", "whether any spring has Maxwell arms", "bool"),
+    _field("spring_gain", "", "n_relaxing", "shared", "tension at once over that at equilibrium, 1 + sum g_i"),
+    _field("spring_arm_modulus", "", "n_arm", "shared", "g_i, arm by arm"),
+    _field("arm_time", "s", "3", "shared", "tau_i of all springs, inf for an arm that is not used"),
+    _field("tet_nodes", "", "n_tet 4", "shared", "corners of each tet", "int32"),
+    _field("tet_rest_volume", "m^3", "n_tet", "alone", "V0"),
+    _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
+    _field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
+    _field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
+    _field("node_rest_volume", "m^3", "n_node", "alone", "volume averaged at a node, a quarter of its tets"),
+    _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
+    _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
+    _field("averages_volume", "", "", "own", "whether any node_bulk is above 0", "bool"),
+    _field("surface_triangles", "", "n_surface 3", "rows", "triangles that may be touched, outward", "int32"),
+    _field("surface_rest_area", "m^2", "n_surface", "rows", ""),
+    _field("support_kind", "", "n_support", "shared", "the solids it rests on, PLANE, SPHERE, ...", "int32"),
+    _field("support_position", "m", "n_support 3", "shared", "middle of each, or a plane's point"),
+    _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world, one a column"),
+    _field("support_size", "m", "n_support 3", "shared", "radius, half length, half sizes"),
+    _field("support_friction", "", "n_support", "shared", "Coulomb coefficient"),
+    _field(
+        "support_nodes", "", "n_support_node", "rows", "free nodes of the surface, which supports may hold", "int32"
+    ),
+    _field("support_area", "m^2", "n_support_node", "rows", "surface area that belongs to each of them"),
+    _field("support_stiffness", "N/m^3", "", "shared", "pressure per penetration"),
+    _field("support_damping", "N s/m^3", "", "shared", "pressure per closing speed"),
+    _field("support_tangential_stiffness", "N/m^3", "", "shared", "traction per stretch while sticking"),
+    _field("foundation_nodes", "", "n_held", "shared", "nodes that elastic foundations hold", "int32"),
+    _field("foundation_position", "m", "n_held 3", "rows", "where those nodes are without force"),
+    _field("foundation_stiffness", "N/m", "n_held 3 3", "rows", "force per displacement, all foundations together"),
+    _field("motion_node_shift", "m", "n_motion n_node 4", "rest", "way of the ground per unit of a signal, and 0"),
+    _field("motion_anchored_nodes", "", "n_anchored", "rows", "anchored nodes of an organ whose ground moves", "int64"),
+    _field("motion_foundation_shift", "m", "n_motion n_held 3", "rows", "likewise at the nodes of foundations"),
+    _field("motion_support_shift", "m", "n_motion n_support 3", "shared", "likewise of supports"),
+    _field("gravity", "m/s^2", "3", "shared", ""),
+    _field("alpha", "1/s", "", "shared", "mass-proportional damping rate"),
+    _field("beta", "s", "", "shared", "stiffness-proportional damping time"),
+    _field("stable_step", "s", "", "own", "largest stable step without contact of instruments"),
+    _field("added_mass", "kg", "", "alone", "part of node_mass that `stability.scale_mass` added"),
 )
 
 # Saved and restored.
 KEPT_FIELDS = (
-    Field("node_position", "m", "n_node 3", "own", ""),
-    Field("node_velocity", "m/s", "n_node 3", "own", ""),
-    Field("node_force", "N", "n_node 3", "own", "force of the last substep, without anchors' reactions"),
-    Field("spring_arm_tension", "N/m", "n_arm", "own", "tension over l0 that each arm has given way to, arm by arm"),
-    Field("spring_relief", "N/m", "n_relaxing", "own", "sum_i g_i times that"),
-    Field("contact_engaged", "", "n_shape n_point", "rows", "1 where a shape holds off a quadrature point", "uint8"),
-    Field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of sticking friction"),
-    Field("contact_passed", "", "2", "rows", "shape and triangle passed through, after such a fault", "int32"),
-    Field("support_stretch", "m", "n_support_node n_support 3", "rows", "tangential stretch of sticking nodes"),
-    Field("motion", "1, 1/s, 1/s, J", "n_motion 4", "rows", "signal, rate, rate before, work of the ground"),
-    Field("volume_ratio_smallest", "", "1", "own", "smallest V / V0 seen since it was last set to 1"),
+    _field("node_position", "m", "n_node 3", "own", ""),
+    _field("node_velocity", "m/s", "n_node 3", "own", ""),
+    _field("node_force", "N", "n_node 3", "own", "force of the last substep, without anchors' reactions"),
+    _field("spring_arm_tension", "N/m", "n_arm", "own", "tension over l0 that each arm has given way to, arm by arm"),
+    _field("spring_relief", "N/m", "n_relaxing", "own", "sum_i g_i times that"),
+    _field("contact_engaged", "", "n_shape n_point", "rows", "1 where a shape holds off a quadrature point", "uint8"),
+    _field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of sticking friction"),
+    _field("contact_passed", "", "2", "rows", "shape and triangle passed through, after such a fault", "int32"),
+    _field("support_stretch", "m", "n_support_node n_support 3", "rows", "tangential stretch of sticking nodes"),
+    _field("motion", "1, 1/s, 1/s, J", "n_motion 4", "rows", "signal, rate, rate before, work of the ground"),
+    _field("volume_ratio_smallest", "", "1", "own", "smallest V / V0 seen since it was last set to 1"),
 )
 
 # Written anew in every call: need not be saved.
 SCRATCH_FIELDS = (
-    Field("node_tension", "Pa", "n_node", "own", "tension of the averaged volume term"),
-    Field("row_position", "m", "n_node 4", "alone", "position in rows of four, which load as one"),
-    Field("row_velocity", "m/s", "n_node 4", "alone", "likewise"),
-    Field("row_force", "N", "n_node 4", "alone", "likewise"),
-    Field("squeezed_tets", "", "n_tet", "shared", "where tets are squeezed below SQUEEZED_RATIO", "int32"),
-    Field("node_pairs", "m^3, J; Pa, 1", "n_soft 2", "halves", "sums of volumes and energies, then see set_node_laws"),
-    Field("node_steepness", "", "n_soft", "own", "excess of the springs' tangent over 1"),
-    Field("spring_lengths", "m", "n_steep", "shared", "lengths of all springs"),
-    Field("steep_springs", "", "n_steep", "shared", "where springs are steep", "int32"),
-    Field("steep_places", "", "n_steep", "shared", "those springs, see squeeze_kernels", "int32"),
-    Field("steep_rows", "", "n_steep steep_width", "own", "likewise"),
-    Field("steep_speed", "m/s", "n_soft 3", "own", "speed that their nodes get to"),
-    Field("contact_candidates", "", "n_shape n_surface", "rows", "triangles in reach, shape by shape", "int32"),
-    Field("contact_rows", "", "n_row row_width", "turns", "a row for each point held off"),
-    Field("contact_places", "", "n_row place_width", "turns", "shape, point and nodes of each row", "int32"),
-    Field("contact_hold", "kg", "n_node", "shared", "hold of contact on a node, times dt^2"),
-    Field("ground_foundation", "m", "n_held 3", "rows", "where foundations hold nodes now"),
-    Field("ground_support", "m, m/s", "n_support 2 3", "rows", "position and velocity of supports now"),
-    Field("ground_load", "N", "n_support 3", "rows", "force of each support on the organ"),
-    Field("ground_rate", "1/s", "n_motion", "own", "rates of the motions' signals"),
-    Field("lane_fault", "", "1", "rows", "FAULT_ code of the last call", "int32"),
-    Field("moving", "", "1", "own", "1 until a fault stops the organ, then 0"),
-    Field("finite_sum", "", "1", "own", "finite where positions and velocities are"),
-    Field("candidate_count", "", "1", "rows", "candidates of the busiest shape", "int32"),
-    Field("contact_kept", "", "1", "rows", "0 where the surface passed through an axis", "uint8"),
-    Field("contact_count", "", "1", "rows", "rows of contact_rows and contact_places in use", "int32"),
+    _field("node_tension", "Pa", "n_node", "own", "tension of the averaged volume term"),
+    _field("row_position", "m", "n_node 4", "alone", "position in rows of four, which load as one"),
+    _field("row_velocity", "m/s", "n_node 4", "alone", "likewise"),
+    _field("row_force", "N", "n_node 4", "alone", "likewise"),
+    _field("squeezed_tets", "", "n_tet", "shared", "where tets are squeezed below SQUEEZED_RATIO", "int32"),
+    _field("node_pairs", "m^3, J; Pa, 1", "n_soft 2", "halves", "sums of volumes and energies, then see set_node_laws"),
+    _field("node_steepness", "", "n_soft", "own", "excess of the springs' tangent over 1"),
+    _field("spring_lengths", "m", "n_steep", "shared", "lengths of all springs"),
+    _field("steep_springs", "", "n_steep", "shared", "where springs are steep", "int32"),
+    _field("steep_places", "", "n_steep", "shared", "those springs, see squeeze_kernels", "int32"),
+    _field("steep_rows", "", "n_steep steep_width", "own", "likewise"),
+    _field("steep_speed", "m/s", "n_soft 3", "own", "speed that their nodes get to"),
+    _field("contact_candidates", "", "n_shape n_surface", "rows", "triangles in reach, shape by shape", "int32"),
+    _field("contact_rows", "", "n_row row_width", "turns", "a row for each point held off"),
+    _field("contact_places", "", "n_row place_width", "turns", "shape, point and nodes of each row", "int32"),
+    _field("contact_hold", "kg", "n_node", "shared", "hold of contact on a node, times dt^2"),
+    _field("ground_foundation", "m", "n_held 3", "rows", "where foundations hold nodes now"),
+    _field("ground_support", "m, m/s", "n_support 2 3", "rows", "position and velocity of supports now"),
+    _field("ground_load", "N", "n_support 3", "rows", "force of each support on the organ"),
+    _field("ground_rate", "1/s", "n_motion", "own", "rates of the motions' signals"),
+    _field("lane_fault", "", "1", "rows", "FAULT_ code of the last call", "int32"),
+    _field("moving", "", "1", "own", "1 until a fault stops the organ, then 0"),
+    _field("finite_sum", "", "1", "own", "finite where positions and velocities are"),
+    _field("candidate_count", "", "1", "rows", "candidates of the busiest shape", "int32"),
+    _field("contact_kept", "", "1", "rows", "0 where the surface passed through an axis", "uint8"),
+    _field("contact_count", "", "1", "rows", "rows of contact_rows and contact_places in use", "int32"),
 )
 
 STATE_FIELDS = KEPT_FIELDS + SCRATCH_FIELDS
@@ -273,7 +281,7 @@ def _in_lanes(fields: tuple[Field, ...]) -> list[str]:
 LaneModel = namedtuple(
     "LaneModel", ("lanes", *_in_lanes(MODEL_FIELDS), "surface_count", "support_count", "anchor_count")
 )
-LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units, laid out as MODEL_FIELDS states.
+LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units, in the layouts of MODEL_FIELDS.
 
 `lanes` are as many zeros as there are lanes, so that their number is part of the compiled type. Of the surface, of
 supports and of anchored nodes a lane uses as many rows as it has: surface_count, support_count and anchor_count
@@ -281,7 +289,7 @@ supports and of anchored nodes a lane uses as many rows as it has: surface_count
 """
 
 LaneState = namedtuple("LaneState", (*_in_lanes(STATE_FIELDS), "kept_force", "surface_count", "support_count"))
-LaneState.__doc__ = """The changing numbers of organs that move side by side, SI units, laid out as STATE_FIELDS states.
+LaneState.__doc__ = """The changing numbers of organs that move side by side, SI units, in the layouts of STATE_FIELDS.
 
 lane_fault is LANE_EMPTY where no organ is; `kept_force` is scratch: node_force of the lanes that do not move [N]
 (n_node, 3, n_lane); surface_count and support_count are how much of the memory belongs to a lane (n_lane,).

@@ -84,7 +84,7 @@ def stack_organs(
     return model
 
 
-def _lane_zeros(field: Field, sizes: Mapping[str, int], lanes: int, dtype: Any) -> NDArray[Any]:
+def _lane_zeros(field: Field, sizes: Mapping[int | str, int], lanes: int, dtype: Any) -> NDArray[Any]:
     """The array of a field in so many lanes, in its layout."""
     lengths = field.lengths(sizes)
     match field.lanes:
@@ -97,7 +97,7 @@ def _lane_zeros(field: Field, sizes: Mapping[str, int], lanes: int, dtype: Any) 
     return aligned_zeros(lengths, field.dtype)
 
 
-def surface_rooms(organ: OrganModel) -> dict[str, int]:
+def surface_rooms(organ: OrganModel) -> dict[int | str, int]:
     """The most rows that an organ of these tets can have for any anchors, by name."""
     faces = np.sort(organ.tet_nodes[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
     outer, times = np.unique(faces, axis=0, return_counts=True)

@@ -21,15 +21,15 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     return state
 
 
-def field_sizes(fields: Iterable[Field], arrays: Iterable[ArrayLike]) -> dict[str, int]:
+def field_sizes(fields: Iterable[Field], arrays: Iterable[ArrayLike]) -> dict[int | str, int]:
     """The lengths of the arrays of some fields, by name."""
     sizes = {}
     for field, array in zip(fields, arrays, strict=True):
-        sizes |= dict(zip(field.shape.split(), np.shape(array), strict=True))
+        sizes |= zip(field.shape, np.shape(array), strict=True)
     return sizes
 
 
-def state_sizes(sizes: Mapping[str, int], shape_count: int) -> dict[str, int]:
+def state_sizes(sizes: Mapping[int | str, int], shape_count: int) -> dict[int | str, int]:
     """The lengths of a state's arrays, by name, from those of its model's."""
     point_count = sizes["n_surface"] * QUADRATURE_COUNT
     return {
@@ -44,6 +44,14 @@ def state_sizes(sizes: Mapping[str, int], shape_count: int) -> dict[str, int]:
     }
 
 
-def zero_state(sizes: Mapping[str, int]) -> OrganState:
+def zero_state(sizes: Mapping[int | str, int]) -> OrganState:
     """A state of zeros, with lengths by name."""
-    return OrganState(**{field.name: aligned_zeros(field.lengths(sizes), field.dtype) for field in STATE_FIELDS})
+    # Rows and pairs of an organ alone load as registers.
+    return OrganState(
+        **{
+            field.name: (aligned_zeros if field.lanes in ("alone", "halves") else np.zeros)(
+                field.lengths(sizes), field.dtype
+            )
+            for field in STATE_FIELDS
+        }
+    )

@@ -102,9 +102,7 @@ MODEL_FIELDS = (
     _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world, one a column"),
     _field("support_size", "m", "n_support 3", "shared", "radius, half length, half sizes"),
     _field("support_friction", "", "n_support", "shared", "Coulomb coefficient"),
-    _field(
-        "support_nodes", "", "n_support_node", "rows", "free nodes of the surface, which supports may hold", "int32"
-    ),
+    _field("support_nodes", "", "n_support_node", "rows", "free nodes that supports may hold", "int32"),
     _field("support_area", "m^2", "n_support_node", "rows", "surface area that belongs to each of them"),
     _field("support_stiffness", "N/m^3", "", "shared", "pressure per penetration"),
     _field("support_damping", "N s/m^3", "", "shared", "pressure per closing speed"),

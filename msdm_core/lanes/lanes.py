@@ -34,7 +34,7 @@ from msdm_core.organ.stepping import unyielding
 
 SHARED = tuple(field.name for field in MODEL_FIELDS if field.lanes == "shared")
 # Fields that follow from the rest shape, shared or each lane's own.
-REST = tuple(field.name for field in MODEL_FIELDS if field.lanes in ("rest", "rows", "first"))
+REST = tuple(field.name for way in ("rest", "rows", "first") for field in MODEL_FIELDS if field.lanes == way)
 # Fields of a state that lanes are filled with: scratch in rows too, as no kernel writes where nothing moves the ground.
 PART_FIELDS = tuple(field for field in STATE_FIELDS if field.name in KEPT_NAMES or field.lanes == "rows")
 # The number of rows that a lane has, and a field with that many.

@@ -73,11 +73,10 @@ def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
 
 
 @njit(**INNER)
-def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin):
-    """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
-
-    Returns the first spring that is in no whole group.
-    """
+def add_energy_groups(model, state):
+    """`tissue_kernels.add_energies` of whole groups of springs; returns the first spring that is in none."""
+    position, pairs, lengths, nodes = state.row_position, state.node_pairs, state.spring_lengths, model.spring_nodes
+    stiffness, rest_length, begin = model.spring_stiffness, model.spring_rest_length, model.tet_nodes.shape[0]
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
     for first in range(begin, whole, GROUP):
         x, y, z = columns(edge_rows(position, nodes, first))
@@ -89,11 +88,15 @@ def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, b
 
 
 @njit(**INNER)
-def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
+def set_node_law_groups(model, state):
     """`tissue_kernels.set_node_laws` of whole groups of nodes.
 
     Returns the first node in none, whether one stiffens and whether one is steep.
     """
+    pairs, steepness, inverse_volume, bulk = (
+        state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
+    )  # fmt: skip
+    softness, onset, growth, excess = model.node_softness, model.node_onset, model.node_growth, model.node_excess
     whole = pairs.shape[0] // GROUP * GROUP
     stiffens = steepens = False
     for first in range(0, whole, GROUP):
@@ -115,17 +118,20 @@ def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, ex
 
 
 @njit(**INNER)
-def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
-    """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
+def add_spring_groups(model, state, law):
+    """`tissue_kernels.add_spring_forces` of whole groups of springs.
 
-    Returns the first spring that is in no whole group, and how many entries `law.steep` has.
+    Returns the first spring that is in none, and how many entries `steep_springs` has.
     """
-    measured, lengths, pairs = law.measured, law.lengths, law.pairs
-    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
-    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
-    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
+    position, force, nodes, begin = state.row_position, state.row_force, model.spring_nodes, model.tet_nodes.shape[0]
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
+    measured, stiffens, steepens, steep_sum = model.stiffens, law.stiffens, law.steepens, 1.0 + model.steep_rise
+    pairs, lengths, steep = state.node_pairs, state.spring_lengths, state.steep_springs
+    relaxes, gain, arm_modulus = model.relaxes, model.spring_gain, model.spring_arm_modulus
+    arm_tension, relief, fades, fade = state.spring_arm_tension, state.spring_relief, law.fades, law.fade
     springs = nodes.shape[0]
-    whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
+    whole = begin + (springs - begin) // GROUP * GROUP
+    steep_count = 0
     for first in range(begin, whole, GROUP):
         rows = edge_rows(position, nodes, first)
         x, y, z = columns(rows)
@@ -151,11 +157,11 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
 
 
 @njit(**INNER)
-def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
-    """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
-
-    Returns the first tet that is in no whole group.
-    """
+def sum_tet_groups(model, state):
+    """`tissue_kernels.sum_at_nodes` of whole groups of tets; returns the first tet that is in none."""
+    position, total, pairs, lengths = state.row_position, state.node_tension, state.node_pairs, state.spring_lengths
+    tets, stiffens = model.tet_nodes, model.stiffens
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
     whole = tets.shape[0] // GROUP * GROUP
     for first in range(0, whole, GROUP):
         b, c, d = tet_edges(position, tets, first)
@@ -171,19 +177,20 @@ def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length
 
 
 @njit(**INNER)
-def add_tet_groups(
-    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed, law,
-    steep_count,
-):  # fmt: skip
-    """Forces of whole groups of tets; arguments as in `tissue_kernels.add_tet_forces`.
+def add_tet_groups(model, state, law, steep_count):
+    """`tissue_kernels.add_tet_forces` of whole groups of tets.
 
-    Returns the first tet that is in no whole group, how many groups have a squeezed tet, and how many entries
-    `law.steep` has.
+    Returns the first tet that is in none, how many groups have a squeezed tet, and how many entries `steep_springs`
+    has.
     """
-    measured, lengths, pairs = law.measured, law.lengths, law.pairs
-    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
-    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
-    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
+    position, force, tension, tets = state.row_position, state.row_force, state.node_tension, model.tet_nodes
+    inverse_volume, bulk, averaged_bulk = model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
+    low, squeezed = state.volume_ratio_smallest, state.squeezed_tets
+    measured, stiffens, steepens, steep_sum = model.stiffens, law.stiffens, law.steepens, 1.0 + model.steep_rise
+    pairs, lengths, steep = state.node_pairs, state.spring_lengths, state.steep_springs
+    relaxes, gain, arm_modulus = model.relaxes, model.spring_gain, model.spring_arm_modulus
+    arm_tension, relief, fades, fade = state.spring_arm_tension, state.spring_relief, law.fades, law.fade
     springs = stiffness.shape[0]
     whole = tets.shape[0] // GROUP * GROUP
     count = 0

@@ -22,32 +22,17 @@ from msdm_core.kernels.structure_kernels import (
 
 
 class SpringLaw(NamedTuple):
-    """How springs depart from linear ones in one substep: fields of model and state, and what the arms lose.
+    """Departures of springs from linear ones in one substep.
 
     Fields:
-        measured: `stiffens` of the model: node_pairs and, of an organ alone, spring_lengths of the state are set
         stiffens: whether springs of any node have a factor other than 1
         steepens: whether any node has a steepness above STEEP_EXCESS
-        pairs, lengths, steep: `node_pairs`, `spring_lengths`, `steep_springs` of the state
-        steep_sum: least sum of the halves of a spring's two ends where it may be steep
-        relaxes, gain, arm_modulus: `relaxes`, `spring_gain` and `spring_arm_modulus` of the model
-        arm_tension, relief: `spring_arm_tension` and `spring_relief` of the state
         fades: whether the arms give way in this substep
         fade: share of its tension that each arm then loses
     """
 
-    measured: bool
     stiffens: bool
     steepens: bool
-    pairs: LaneArray
-    lengths: FloatArray
-    steep: NDArray[np.int32]
-    steep_sum: float
-    relaxes: bool
-    gain: FloatArray
-    arm_modulus: FloatArray
-    arm_tension: LaneArray
-    relief: LaneArray
     fades: bool
     fade: tuple[float, float, float]
 

@@ -153,52 +153,29 @@ def _evaluate(model, state, fades, fade_duration):
             faded_share(fade_duration, time[0]), faded_share(fade_duration, time[1]),
             faded_share(fade_duration, time[2]),
         )  # fmt: skip
-    lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
-    position, velocity, force = nodes_of(lanes, state)
-    tension = state.node_tension
-    averages, stiffens = _averages(lanes, model.averages_volume), model.stiffens
-    pairs, lengths = state.node_pairs, state.spring_lengths
+    lanes, beta = lanes_of(model), model.beta
+    averages, stiffens, steepens = _averages(lanes, model.averages_volume), model.stiffens, False
     if stiffens:
-        pairs[:] = 0.0
+        state.node_pairs[:] = 0.0
     else:
-        tension[:] = 0.0
+        state.node_tension[:] = 0.0
     if averages or stiffens:
-        sum_at_nodes(
-            lanes, position, tension, pairs, lengths, tets, model.spring_stiffness, model.spring_rest_length, stiffens
-        )
+        sum_at_nodes(lanes, model, state)
     if averages and beta > 0.0:
-        add_volume_rates(lanes, position, velocity, tension, pairs, tets, beta, stiffens)
-    steepens = False
+        add_volume_rates(lanes, model, state)
     if stiffens:
-        add_energies(
-            lanes, position, pairs, lengths, model.spring_nodes, model.spring_stiffness, model.spring_rest_length,
-            tets.shape[0],
-        )  # fmt: skip
-        stiffens, steepens = set_node_laws(
-            lanes, pairs, model.node_inverse_volume, model.node_bulk, model.node_softness, model.node_onset,
-            model.node_growth, model.node_excess, state.node_steepness,
-        )  # fmt: skip
+        add_energies(lanes, model, state)
+        stiffens, steepens = set_node_laws(lanes, model, state)
     elif averages:
-        set_node_tension(lanes, tension, model.node_inverse_volume, model.node_bulk)
-    law = SpringLaw(
-        model.stiffens, stiffens, steepens, pairs, lengths, state.steep_springs, 1.0 + model.steep_rise,
-        model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
-        fades, fade,
-    )  # fmt: skip
-    set_gravity(lanes, force, model.node_mass, model.gravity)
-    steep_count = add_spring_forces(
-        lanes, position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0],
-        law, state.moving,
-    )  # fmt: skip
+        set_node_tension(lanes, state.node_tension, model.node_inverse_volume, model.node_bulk)
+    law = SpringLaw(stiffens, steepens, fades, fade)
+    set_gravity(lanes, model, state)
+    steep_count = add_spring_forces(lanes, model, state, law)
     if beta > 0.0:
-        add_spring_damping(lanes, position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
-    squeezed_count, steep_count = add_tet_forces(
-        lanes, position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
-        model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
-        state.squeezed_tets, law, steep_count,
-    )  # fmt: skip
+        add_spring_damping(lanes, model, state)
+    squeezed_count, steep_count = add_tet_forces(lanes, model, state, law, steep_count)
     if beta > 0.0:
-        add_volume_damping(lanes, position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
+        add_volume_damping(lanes, model, state)
     return squeezed_count, steep_count
 
 
@@ -229,7 +206,7 @@ def _keep_forces(lanes, state):
 def _put_back_forces(lanes, state):
     """Restore the forces of lanes that do not move."""
     if len(lanes) > 0:
-        put_back(lanes, state.node_force, state.kept_force, state.moving)
+        put_back(lanes, state)
 
 
 @njit(**INLINED)
@@ -438,7 +415,6 @@ def advance_inside(model, state, shapes, law, response, dt, decay, substep_count
     wrench[:] = 0.0
     _wake(lanes, state)
     _load_rows(lanes, state)
-    position, velocity, force = nodes_of(lanes, state)
     _begin(lanes, model, state, shapes, response, dt * substep_count)
     fade_every = max(1, int(FADE_INTERVAL / dt + 0.5))
     faded = 0
@@ -455,9 +431,7 @@ def advance_inside(model, state, shapes, law, response, dt, decay, substep_count
         ):
             break
         _move_ground(lanes, model, state, dt, decay)
-        integrate(
-            lanes, position, velocity, force, model.node_inverse_mass, dt, decay, state.moving, state.finite_sum
-        )  # fmt: skip
+        integrate(lanes, model, state, dt, decay)
         if _move_tools(lanes, state, shapes, response, dt, substep, wrench) == 0:
             break
     _end(lanes, model, state, shapes, law, response, substep_count, wrench)

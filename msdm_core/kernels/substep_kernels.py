@@ -28,7 +28,7 @@ from msdm_core.kernels.lane_view_kernels import (
     surface_of,
     touched_of,
 )
-from msdm_core.kernels.layout_kernels import load_part, store_part
+from msdm_core.kernels.layout_kernels import group_width, load_part, store_part
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
@@ -52,7 +52,6 @@ from msdm_core.kernels.tissue_kernels import (
     add_tet_forces,
     add_volume_damping,
     add_volume_rates,
-    group_width,
     integrate,
     put_back,
     set_gravity,
@@ -335,13 +334,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         if steep_count == 0:
             _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
     if steep_count > 0 and moving > 0:
-        position, velocity, force = nodes_of(lanes, state)
-        hold_steep(
-            lanes, position, velocity, force, model.node_inverse_mass,
-            model.spring_nodes, model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes,
-            model.tet_nodes.shape[0], state.steep_springs, steep_count, group_width(lanes),
-            SWEEPS_LEAST, model.steep_sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
-        )  # fmt: skip
+        hold_steep(lanes, model, state, steep_count, SWEEPS_LEAST, dt)
         for lane in range(_lane_count(lanes)):
             if state.lane_fault[lane] == FAULT_NONE:
                 _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)

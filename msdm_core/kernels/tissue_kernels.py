@@ -39,6 +39,7 @@ from msdm_core.kernels.layout_kernels import (
     corner_mean,
     corner_mean_of_pairs,
     difference,
+    group_width,
     load_half,
     load_item,
     load_part,
@@ -53,15 +54,7 @@ from msdm_core.kernels.layout_kernels import (
     where_moving,
 )
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
-from msdm_core.kernels.vector_kernels import GROUP, any_below, keep_lower
-
-
-@njit(**INLINED)
-def group_width(lanes):
-    """How many tets in a row an entry of `squeezed_tets` stands for."""
-    if len(lanes) == 0:
-        return GROUP
-    return 1
+from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 
 @njit(**INNER)

@@ -9,6 +9,7 @@ from msdm_core.errors import OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS, STRAIN_LEAST, node_law
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, KEPT_NAMES, ContactLaw, OrganModel, OrganState
+from msdm_core.kernels.vector_kernels import GROUP
 from msdm_core.lanes.lanes import get_lane, lane_responses, lanes_of, put_lane, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Lesion, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
@@ -328,14 +329,15 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
 def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatArray:
     """The matrix that `hold_steep` makes of velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
     scale = np.sqrt(model.node_mass)[:, None]
-    every, columns = np.arange(len(model.spring_nodes), dtype=np.int32), []
+    tets, springs, columns = len(model.tet_nodes), len(model.spring_nodes), []
+    groups = np.r_[0:tets:GROUP, tets:springs:GROUP].astype(np.int32)
+    swept = model._replace(steep_sweeps=sweeps)
     for unit in np.eye(state.node_velocity.size):
         velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
-        hold_steep(
-            (), state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes,
-            model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes),
-            every, len(every), 1, sweeps, sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
-        )  # fmt: skip
+        rows = state._replace(
+            row_position=state.node_position, row_velocity=velocity, row_force=force, steep_springs=groups
+        )
+        hold_steep((), swept, rows, len(groups), sweeps, dt)
         columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
     return np.array(columns).T
 

@@ -63,13 +63,14 @@ def _give_way(arm_tension, arm, elastic, fade):
 
 
 @njit(**INLINED)
-def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
+def _fade_arms(model, state, first, elastic, fade):
     """`tissue_kernels.fade_arms` of a group of springs."""
+    arm_modulus, arm_tension, springs = model.spring_arm_modulus, state.spring_arm_tension, model.spring_nodes.shape[0]
     second, third = springs + first, 2 * springs + first
     total = load_group(arm_modulus, first) * _give_way(arm_tension, first, elastic, fade[0])
     total = total + load_group(arm_modulus, second) * _give_way(arm_tension, second, elastic, fade[1])
     total = total + load_group(arm_modulus, third) * _give_way(arm_tension, third, elastic, fade[2])
-    store_group(relief, first, total)
+    store_group(state.spring_relief, first, total)
 
 
 @njit(**INNER)
@@ -125,33 +126,30 @@ def add_spring_groups(model, state, law):
     """
     position, force, nodes, begin = state.row_position, state.row_force, model.spring_nodes, model.tet_nodes.shape[0]
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
-    measured, stiffens, steepens, steep_sum = model.stiffens, law.stiffens, law.steepens, 1.0 + model.steep_rise
-    pairs, lengths, steep = state.node_pairs, state.spring_lengths, state.steep_springs
-    relaxes, gain, arm_modulus = model.relaxes, model.spring_gain, model.spring_arm_modulus
-    arm_tension, relief, fades, fade = state.spring_arm_tension, state.spring_relief, law.fades, law.fade
-    springs = nodes.shape[0]
-    whole = begin + (springs - begin) // GROUP * GROUP
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
+    whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
     steep_count = 0
     for first in range(begin, whole, GROUP):
         rows = edge_rows(position, nodes, first)
         x, y, z = columns(rows)
-        if measured:
+        if model.stiffens:
             length = load_group(lengths, first)
         else:
             length = spring_length(x, y, z)
         share = load_group(rest_length, first) / length
         rigidity = load_group(stiffness, first)
         scale = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             factor = end_sums(pairs, nodes, first)
             scale = scale * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 steep[steep_count] = first
                 steep_count += 1
-        if relaxes:
-            if fades:
-                _fade_arms(arm_modulus, arm_tension, relief, springs, first, scale / share, fade)
-            scale = scale * load_group(gain, first) - load_group(relief, first) * share
+        if model.relaxes:
+            if law.fades:
+                _fade_arms(model, state, first, scale / share, law.fade)
+            scale = scale * load_group(model.spring_gain, first) - load_group(state.spring_relief, first) * share
         pull_ends(force, nodes, first, (rows, scale))
     return whole, steep_count
 
@@ -184,44 +182,41 @@ def add_tet_groups(model, state, law, steep_count):
     has.
     """
     position, force, tension, tets = state.row_position, state.row_force, state.node_tension, model.tet_nodes
-    inverse_volume, bulk, averaged_bulk = model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
     low, squeezed = state.volume_ratio_smallest, state.squeezed_tets
-    measured, stiffens, steepens, steep_sum = model.stiffens, law.stiffens, law.steepens, 1.0 + model.steep_rise
-    pairs, lengths, steep = state.node_pairs, state.spring_lengths, state.steep_springs
-    relaxes, gain, arm_modulus = model.relaxes, model.spring_gain, model.spring_arm_modulus
-    arm_tension, relief, fades, fade = state.spring_arm_tension, state.spring_relief, law.fades, law.fade
-    springs = stiffness.shape[0]
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
     whole = tets.shape[0] // GROUP * GROUP
     count = 0
     lowest = spread_group(low[0])
     for first in range(0, whole, GROUP):
         b, c, d = tet_edges(position, tets, first)
         gradient, six = tet_shape(b, c, d)
-        ratio = volume_ratio(six, load_group(inverse_volume, first))
+        ratio = volume_ratio(six, load_group(model.tet_inverse_volume, first))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
             squeezed[count] = first
             count += 1
-        if measured:
+        if model.stiffens:
             averaged, factor = pair_sums(pairs, tets, first)
             length = load_group(lengths, first)
         else:
             averaged, length = corner_sums(tension, tets, first), spring_length(b[0], b[1], b[2])
             factor = length
-        scale = tet_scale(ratio, load_group(bulk, first), load_group(averaged_bulk, first), 0.25 * averaged)
+        bulk, averaged_bulk = load_group(model.tet_bulk, first), load_group(model.tet_averaged_bulk, first)
+        scale = tet_scale(ratio, bulk, averaged_bulk, 0.25 * averaged)
         share = load_group(rest_length, first) / length
         rigidity = load_group(stiffness, first)
         pull = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             pull = pull * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 steep[steep_count] = first
                 steep_count += 1
-        if relaxes:
-            if fades:
-                _fade_arms(arm_modulus, arm_tension, relief, springs, first, pull / share, fade)
-            pull = pull * load_group(gain, first) - load_group(relief, first) * share
+        if model.relaxes:
+            if law.fades:
+                _fade_arms(model, state, first, pull / share, law.fade)
+            pull = pull * load_group(model.spring_gain, first) - load_group(state.spring_relief, first) * share
         at_b = (
             scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
         )  # fmt: skip

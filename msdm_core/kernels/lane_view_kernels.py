@@ -150,9 +150,9 @@ def _numbers_of(values, lane, count):
 
 @njit(**INLINED)
 def surface_of(lanes, model, lane):
-    """One lane's surface, as contact reads it."""
+    """One lane's surface; kernels that read it take an OrganModel as well."""
     if len(lanes) == 0:
-        return SurfaceView(model.surface_triangles, model.surface_rest_area, model.node_inverse_mass)
+        return model
     count = model.surface_count[lane]
     return SurfaceView(
         _triangles_of(model.surface_triangles, lane, count), _numbers_of(model.surface_rest_area, lane, count),
@@ -164,11 +164,7 @@ def surface_of(lanes, model, lane):
 def supports_of(lanes, model, lane):
     """One lane's supports; kernels that read them take an OrganModel as well."""
     if len(lanes) == 0:
-        return _Supports(
-            model.support_kind, model.support_position, model.support_rotation, model.support_size,
-            model.support_friction, model.support_nodes, model.support_area,
-            model.support_stiffness, model.support_damping, model.support_tangential_stiffness,
-        )  # fmt: skip
+        return model
     count = model.support_count[lane]
     return _Supports(
         model.support_kind, model.support_position, model.support_rotation, model.support_size, model.support_friction,

@@ -115,14 +115,6 @@ def _end_sum(lanes, pairs, items, item):
 
 
 @njit(**INLINED)
-def _add_groups_of_energies(lanes, model, state):
-    """`add_energy_groups` for an organ alone; returns the first spring that is left over."""
-    if len(lanes) == 0:
-        return add_energy_groups(model, state)
-    return model.tet_nodes.shape[0]
-
-
-@njit(**INLINED)
 def _keep_length(lanes, lengths, spring, length):
     """Note the length of a spring of an organ alone.
 
@@ -157,19 +149,14 @@ def add_energies(lanes, model, state):
     position, _, _ = nodes_of(lanes, state)
     pairs, lengths, nodes = state.node_pairs, state.spring_lengths, model.spring_nodes
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
-    for spring in range(_add_groups_of_energies(lanes, model, state), nodes.shape[0]):
+    first = model.tet_nodes.shape[0]
+    if len(lanes) == 0:
+        first = add_energy_groups(model, state)
+    for spring in range(first, nodes.shape[0]):
         edge = difference(lanes, position, nodes, spring, 1)
         twice = _measure(lanes, position, lengths, spring, stiffness, rest_length, edge)
         add_half(lanes, pairs, nodes[spring, 0], 1, twice)
         add_half(lanes, pairs, nodes[spring, 1], 1, twice)
-
-
-@njit(**INLINED)
-def _set_groups_of_node_laws(lanes, model, state):
-    """`set_node_law_groups` for an organ alone; returns the first node left over, and what `set_node_laws` does."""
-    if len(lanes) == 0:
-        return set_node_law_groups(model, state)
-    return 0, False, False
 
 
 @njit(**INNER)
@@ -185,7 +172,9 @@ def set_node_laws(lanes, model, state):
         state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
     )  # fmt: skip
     softness, onset, growth, excess = model.node_softness, model.node_onset, model.node_growth, model.node_excess
-    first, stiffens, steepens = _set_groups_of_node_laws(lanes, model, state)
+    first, stiffens, steepens = 0, False, False
+    if len(lanes) == 0:
+        first, stiffens, steepens = set_node_law_groups(model, state)
     for node in range(first, steepness.shape[0]):
         six, energy = load_half(lanes, pairs, node, 0), load_half(lanes, pairs, node, 1)
         tension = node_tension(six, load_shared(lanes, pairs, inverse_volume, node), load_item(lanes, bulk, node))
@@ -207,14 +196,6 @@ def set_node_laws(lanes, model, state):
 
 
 @njit(**INLINED)
-def _add_groups_of_springs(lanes, model, state, law):
-    """`add_spring_groups` for an organ alone; returns the first spring left over and the entries of `steep_springs`."""
-    if len(lanes) == 0:
-        return add_spring_groups(model, state, law)
-    return model.tet_nodes.shape[0], 0
-
-
-@njit(**INLINED)
 def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
     """Let one arm give way to the elastic tension over l0 of its spring [N/m]; returns what it has given way to."""
     before = load_item(lanes, arm_tension, arm)
@@ -224,15 +205,17 @@ def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
 
 
 @njit(**INLINED)
-def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic, fade, moving):
+def fade_arms(lanes, model, state, spring, elastic, fade):
     """Let the Maxwell arms of a spring give way to its elastic tension for some time: z_i <- z_i + fade_i (T_e - z_i).
 
     The arm's own tension is g_i (T_e - z_i); all tensions are over l0. For a constant strain z_i nears T_e as
     1 - exp(-t / tau_i), and the energy stored in an arm only falls while it gives way.
 
-    In:  arm_modulus g_i (3 * n_spring,), springs: n_spring, elastic T_e / l0 [N/m], fade: share for each arm, moving
-    Out: arm_tension z_i / l0 [N/m] (3 * n_spring,), relief: sum_i g_i z_i / l0 [N/m] (n_spring,)
+    In:  elastic T_e / l0 [N/m], fade: share for each arm
+    Out: spring_arm_tension z_i / l0, spring_relief
     """
+    arm_modulus, arm_tension, relief = model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief
+    moving, springs = state.moving, model.spring_nodes.shape[0]
     second, third = springs + spring, 2 * springs + spring
     total = load_shared(lanes, arm_tension, arm_modulus, spring) * _give_way(
         lanes, arm_tension, spring, elastic, fade[0], moving
@@ -255,36 +238,37 @@ def add_spring_forces(lanes, model, state, law):
     """
     position, _, force = nodes_of(lanes, state)
     nodes, stiffness, rest_length = model.spring_nodes, model.spring_stiffness, model.spring_rest_length
-    begin, moving = model.tet_nodes.shape[0], state.moving
-    measured, stiffens, steepens, steep_sum = model.stiffens, law.stiffens, law.steepens, 1.0 + model.steep_rise
-    pairs, lengths, steep = state.node_pairs, state.spring_lengths, state.steep_springs
-    relaxes, gain, arm_modulus = model.relaxes, model.spring_gain, model.spring_arm_modulus
-    arm_tension, relief, fades, fade = state.spring_arm_tension, state.spring_relief, law.fades, law.fade
-    first, steep_count = _add_groups_of_springs(lanes, model, state, law)
+    begin = model.tet_nodes.shape[0]
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
+    first, steep_count = begin, 0
+    if len(lanes) == 0:
+        first, steep_count = add_spring_groups(model, state, law)
     width = group_width(lanes)
     for spring in range(first, nodes.shape[0]):
         x, y, z = difference(lanes, position, nodes, spring, 1)
-        if measured:
+        if model.stiffens:
             length = _kept_length(lanes, lengths, spring, x, y, z)
         else:
             length = spring_length(x, y, z)
         share = load_shared(lanes, position, rest_length, spring) / length
         rigidity = load_item(lanes, stiffness, spring)
         scale = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             factor = _end_sum(lanes, pairs, nodes, spring)
             scale = scale * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 entry = begin + (spring - begin) // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry
                     steep_count += 1
-        if relaxes:
-            if fades:
-                fade_arms(
-                    lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], spring, scale / share, fade, moving
-                )
-            scale = scale * load_shared(lanes, position, gain, spring) - load_item(lanes, relief, spring) * share
+        if model.relaxes:
+            if law.fades:
+                fade_arms(lanes, model, state, spring, scale / share, law.fade)
+            gain, relief = (
+                load_shared(lanes, position, model.spring_gain, spring), load_item(lanes, state.spring_relief, spring)
+            )  # fmt: skip
+            scale = scale * gain - relief * share
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
     return steep_count
 
@@ -301,14 +285,6 @@ def add_spring_damping(lanes, model, state):
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
 
 
-@njit(**INLINED)
-def _sum_groups_of_tets(lanes, model, state):
-    """`sum_tet_groups` for an organ alone; returns the first tet that is left over."""
-    if len(lanes) == 0:
-        return sum_tet_groups(model, state)
-    return 0
-
-
 @njit(**INNER)
 def sum_at_nodes(lanes, model, state):
     """Six times the volume of each tet [m^3] added up at its corners, in node_tension.
@@ -318,7 +294,10 @@ def sum_at_nodes(lanes, model, state):
     position, _, _ = nodes_of(lanes, state)
     total, pairs, lengths, tets = state.node_tension, state.node_pairs, state.spring_lengths, model.tet_nodes
     stiffness, rest_length, stiffens = model.spring_stiffness, model.spring_rest_length, model.stiffens
-    for tet in range(_sum_groups_of_tets(lanes, model, state), tets.shape[0]):
+    first = 0
+    if len(lanes) == 0:
+        first = sum_tet_groups(model, state)
+    for tet in range(first, tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         _, six = tet_shape(b, c, d)
         if stiffens:
@@ -376,14 +355,6 @@ def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
     take_from_node(lanes, force, tets[tet, 0], x + gx, y + gy, z + gz)
 
 
-@njit(**INLINED)
-def _add_groups_of_tets(lanes, model, state, law, steep_count):
-    """`add_tet_groups` for an organ alone; returns the first tet left over and the entries of both lists."""
-    if len(lanes) == 0:
-        return add_tet_groups(model, state, law, steep_count)
-    return 0, 0, steep_count
-
-
 @njit(**INNER)
 def add_tet_forces(lanes, model, state, law, steep_count):
     """Volume terms: a tet pulls its corners with its tension times dV/dx; spring t comes with tet t, its first edge.
@@ -396,53 +367,56 @@ def add_tet_forces(lanes, model, state, law, steep_count):
     Returns how many entries `squeezed_tets` and `steep_springs` have.
     """
     position, _, force = nodes_of(lanes, state)
-    tension, tets, inverse_volume = state.node_tension, model.tet_nodes, model.tet_inverse_volume
-    bulk, averaged_bulk = model.tet_bulk, model.tet_averaged_bulk
+    tension, tets = state.node_tension, model.tet_nodes
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
-    low, moving, squeezed = state.volume_ratio_smallest, state.moving, state.squeezed_tets
-    measured, stiffens, steepens, steep_sum = model.stiffens, law.stiffens, law.steepens, 1.0 + model.steep_rise
-    pairs, lengths, steep = state.node_pairs, state.spring_lengths, state.steep_springs
-    relaxes, gain, arm_modulus = model.relaxes, model.spring_gain, model.spring_arm_modulus
-    arm_tension, relief, fades, fade = state.spring_arm_tension, state.spring_relief, law.fades, law.fade
-    first, count, steep_count = _add_groups_of_tets(lanes, model, state, law, steep_count)
+    low, squeezed = state.volume_ratio_smallest, state.squeezed_tets
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
+    first, count = 0, 0
+    if len(lanes) == 0:
+        first, count, steep_count = add_tet_groups(model, state, law, steep_count)
     width = group_width(lanes)
     lowest = load_item(lanes, low, 0)
     for tet in range(first, tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         gradient, six = tet_shape(b, c, d)
-        ratio = volume_ratio(six, load_shared(lanes, position, inverse_volume, tet))
+        ratio = volume_ratio(six, load_shared(lanes, position, model.tet_inverse_volume, tet))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
             entry = tet // width * width
             if count == 0 or squeezed[count - 1] != entry:
                 squeezed[count] = entry
                 count += 1
-        if measured:
+        if model.stiffens:
             averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
             length = _kept_length(lanes, lengths, tet, b[0], b[1], b[2])
         else:
             averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(b[0], b[1], b[2])
-        scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)
+        bulk, averaged_bulk = load_item(lanes, model.tet_bulk, tet), load_item(lanes, model.tet_averaged_bulk, tet)
+        scale = tet_scale(ratio, bulk, averaged_bulk, averaged)
         share = load_shared(lanes, position, rest_length, tet) / length
         rigidity = load_item(lanes, stiffness, tet)
         pull = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             factor = _end_sum(lanes, pairs, tets, tet)
             pull = pull * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 entry = tet // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry
                     steep_count += 1
-        if relaxes:
-            if fades:
-                fade_arms(lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], tet, pull / share, fade, moving)
-            pull = pull * load_shared(lanes, position, gain, tet) - load_item(lanes, relief, tet) * share
+        if model.relaxes:
+            if law.fades:
+                fade_arms(lanes, model, state, tet, pull / share, law.fade)
+            gain, relief = (
+                load_shared(lanes, position, model.spring_gain, tet), load_item(lanes, state.spring_relief, tet)
+            )  # fmt: skip
+            pull = pull * gain - relief * share
         at_b = (
             scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
         )  # fmt: skip
         _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b)
-    store_item(lanes, low, 0, where_moving(lanes, moving, lowest, load_item(lanes, low, 0)))
+    store_item(lanes, low, 0, where_moving(lanes, state.moving, lowest, load_item(lanes, low, 0)))
     return count, steep_count
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.envs.surgical_env import Info, Observation, SurgicalEnv
-from surgsim_env.palpation.press import PressPhase, SitePress, press_alone, press_in_lanes, press_phases
+from surgsim_env.palpation.site_press import PressPhase, SitePress, press_alone, press_in_lanes, press_phases
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 

@@ -38,7 +38,12 @@ class BimanualRetractEnv(SurgicalEnv):
 
 
 def register_task(
-    id: str, task_class: type[Task], *, entry_point: str | None = None, vector_entry_point: str | None = None
+    id: str,
+    task_class: type[Task],
+    *,
+    lanes: bool = True,
+    entry_point: str | None = None,
+    vector_entry_point: str | None = None,
 ) -> None:
     """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
 
@@ -48,6 +53,7 @@ def register_task(
     Args:
         id: "Namespace/Name-v0".
         task_class: declares channels and rewards (`surgsim_env.Task`).
+        lanes: whether its instrument can act in many environments side by side: one arm can, a pair cannot.
         entry_point: "module:class" of the environment, for a task that needs a class of its own.
         vector_entry_point: likewise of the vector environment.
     """
@@ -56,8 +62,8 @@ def register_task(
     gym.register(
         id=id,
         entry_point=entry_point or f"surgsim_env.envs.ids:{id}",
-        vector_entry_point=(vector_entry_point or f"surgsim_env.envs.vector_env:{id}") if task_class.lanes else None,
-        max_episode_steps=task_class.episode_steps,
+        vector_entry_point=(vector_entry_point or f"surgsim_env.envs.vector_env:{id}") if lanes else None,
+        max_episode_steps=task_class.setup.episode_steps,
     )
 
 
@@ -83,7 +89,7 @@ def register() -> None:
     """Register the shipped ids with Gymnasium; importing `surgsim_env` does it."""
     register_task("SurgSim/Palpate-v0", PalpateTask)
     register_task("SurgSim/Retract-v0", RetractTask)
-    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask)
+    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask, lanes=False)
     register_task(
         "SurgSim/PalpateSites-v0",
         PalpateSitesTask,

@@ -25,7 +25,7 @@ class PalpateSitesEnv(SurgicalEnv):
         self.phases: tuple[PressPhase, ...] = press_phases(self.scene)
         # A press that was made among others, for the next `step` to take.
         self._made: tuple[Site, SitePress] | None = None
-        self._limited = False
+        self._limited = self._saturated = False
 
     def load_state(self, state: bytes) -> None:
         """As `SurgicalEnv.load_state`; a press that was begun is forgotten."""
@@ -33,8 +33,12 @@ class PalpateSitesEnv(SurgicalEnv):
         self._made = None
 
     def _draw(self) -> None:
-        self._made, self._limited = None, False
+        self._made, self._limited, self._saturated = None, False, False
         super()._draw()
+
+    def _maker(self) -> str:
+        """As `SurgicalEnv._maker`, and the budget, on which observations and rewards depend."""
+        return f"{super()._maker()}, budget={self.task.given_budget}"
 
     def begin_press(self, action: Action | FloatArray) -> SitePress:
         """Put the organ at rest and the tip over the site that an action names; the next `step` takes the press."""
@@ -51,13 +55,13 @@ class PalpateSitesEnv(SurgicalEnv):
         assert self._made is not None
         (site, press), self._made = self._made, None
         result = press.result()
-        self.task.take(site, result)
+        self._saturated = not self.simulation.fault and self.task.take(site, result, self.np_random)
         self._limited = result.workspace_limited
         return result.force_peak
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
         """Of the whole press, where a simulation says only whether the instrument is limited at its end."""
-        info = super()._info(fault, saturated, task_info, rewards)
+        info = super()._info(fault, self._saturated, task_info, rewards)
         return {**info, "workspace_limited": self._limited}
 
 

@@ -157,7 +157,7 @@ class LaneVectorEnv(SyncVectorEnv):
         """Advance the active of a group's environments (n,) by what a step lasts."""
         first = self._singles[members.start]
         count = first.scene.timing.haptic_steps_per_control
-        group.control_step(active, count, first.task.force_limit, first.task.pull_limit)
+        group.control_step(active, count, first.runtime.force_limit, first.runtime.pull_limit)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads and close the environments."""

@@ -7,11 +7,12 @@ from torch import nn
 from torch.nn.functional import max_pool2d
 
 from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.tasks.layout import channel_slices
 from surgsim_env.tasks.palpate import PalpateTask
 
 # Channels of the observation.
-FACE = PalpateTask.channel_slices(
-    contrast=MAP_SIDE**2, visited=MAP_SIDE**2, face=MAP_SIDE**2, stiffest=3, tip_place=3, tip_depth=1,
+FACE = channel_slices(
+    PalpateTask, contrast=MAP_SIDE**2, visited=MAP_SIDE**2, face=MAP_SIDE**2, stiffest=3, tip_place=3, tip_depth=1,
     surface_normal=3, face_force=3, map_cell=1, chart_share=2,
 )  # fmt: skip
 OBSERVATION_SIZE = max(part.stop for part in FACE.values())

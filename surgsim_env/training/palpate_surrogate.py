@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from surgsim_env.palpation.chart import MAP_SIDE
 from surgsim_env.palpation.touches import stiffest_spots
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, reward_weights
 from surgsim_env.tasks.palpate import (
     DECLARE_STEPS,
     DECLARE_VALUE,
@@ -28,7 +29,6 @@ from surgsim_env.tasks.palpate import (
     PalpateTask,
     touch_memory,
 )
-from surgsim_env.tasks.task import SPEED_FULL_SCALE
 
 SCENE = "phantom_small"
 # The formula's numbers, fitted to the full physics at level "standard": c [N], p, the ranges of A and s [m], and of
@@ -164,7 +164,7 @@ class PalpateSurrogate(VectorEnv):
         self, force: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Callable[[int], dict[str, Any]]]:
         """Rewards, ends and infos, as `PalpateTask.judge` has them."""
-        limits, weights = self.scene.limits, PalpateTask.weights
+        limits, weights = self.scene.limits, reward_weights(PalpateTask)
         hard = force > limits.hard_force
         declared = ~hard & (self.declared >= DECLARE_STEPS)
         error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import matmul
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import BACKGROUND_SPREAD, EXCESS_SPREAD, contrast_process
+from surgsim_env.tasks.layout import channel_slices
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 # Sites nearer to the chart's border than this share of its side are not pressed: half of the area that a press there
@@ -26,7 +27,8 @@ FIRST_LENGTHS = 6.0
 
 SITE_COUNT = MAP_SIDE * MAP_SIDE
 # Entries of the observation with memory, by channel.
-SLICES = PalpateSitesTask.channel_slices(
+SLICES = channel_slices(
+    PalpateSitesTask,
     **dict.fromkeys(("contrast_map", "pressed_map", "face_map"), SITE_COUNT),
     map_cell=1,
     chart_share=2,

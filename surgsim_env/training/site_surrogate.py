@@ -15,6 +15,7 @@ from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
 from surgsim_env.scene.levels import REFERENCE_TIP
+from surgsim_env.tasks.declaration import reward_weights
 from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
 from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES
 
@@ -85,7 +86,7 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.memory[SLICES["presses_left"]] = 1.0 - len(self.sites) / self.budget
         found_before = self.found
         self.error, self.found = self._judged()
-        weights = PalpateSitesTask.weights
+        weights = reward_weights(PalpateSitesTask)
         reward = weights["error"] * self.error / self.cutoff / self.budget
         reward += weights["found"] * (self.found - found_before)
         over = len(self.sites) >= self.budget

@@ -4,8 +4,9 @@ import torch
 from torch import nn
 
 from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE
+from surgsim_env.tasks.channels import LENGTH_SCALE
+from surgsim_env.tasks.layout import channel_slices
 from surgsim_env.tasks.palpate import PalpateTask
-from surgsim_env.tasks.task import LENGTH_SCALE
 
 # Radius of the blocks' tip [m].
 TIP_RADIUS = 0.008
@@ -14,7 +15,8 @@ SEARCH_REACH = 0.8
 # A press is about a quarter of the soft limit, and a lesion about a quarter stiffer than the tissue around it.
 GAIN = 4.0
 # Channels of the observation in frame="world", in which those of frame="face" have no entry.
-CHANNELS = PalpateTask.channel_slices(
+CHANNELS = channel_slices(
+    PalpateTask,
     **dict.fromkeys(("tip_place", "tip_depth", "surface_normal", "face_force", "map_cell", "chart_share"), 0),
     **dict.fromkeys(("contrast", "visited", "face"), MAP_SIDE**2),
     stiffest=3,

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_env import CONTACT_FORCE, TIP_POSITION, Channel, PalpateTask, Reward, Task, register_task
+from surgsim_env import CONTACT_FORCE, TIP_POSITION, Channel, PalpateTask, Reward, Setup, Task, register_task
 from surgsim_env.envs.ids import TASKS, environment_class
 from surgsim_env.scripting import oracle_script, run_script
 from tests.envs.own_task import load_own_task
@@ -32,7 +32,7 @@ class Touch(Task):
 
     channels = (TIP_POSITION, CONTACT_FORCE)
     rewards = (Reward("time", -1.0, "step", "each control step"), Reward("success", 1.0, "success", "it was touched"))
-    default_scene = "phantom_small"
+    setup = Setup(scene="phantom_small")
 
     def draw(self, rng):
         point, normal = self.anatomy.face.random_point(rng, 0.01)
@@ -91,8 +91,8 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
     class Gentle(Touch):
         kept = ("place", "steps", "words")
 
-        def __init__(self, anatomy, instrument, *, force=0.05):
-            super().__init__(anatomy, instrument)
+        def __init__(self, scenario, *, force=0.05):
+            super().__init__(scenario)
             self.force = force
 
         def draw(self, rng):
@@ -100,7 +100,7 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
             return super().draw(rng)
 
         def update(self, step):
-            self.steps = [self.steps[0] + 1, 0.5]
+            self.steps = [self.step_count, 0.5]
 
         def end(self, step):
             return super().end(step) or (

@@ -187,7 +187,7 @@ release: committed lint docs test-all test-agents-all test-distributed test-lero
 
 clean:
 	rm -rf runs build dist site .pytest_cache .ruff_cache .hypothesis .numba_cache
-	find msdm_core surgsim_env agents benchmarks docs scenes tests -name __pycache__ -prune -exec rm -rf {} +
+	find msdm_core surgsim_env surgsim_apps agents benchmarks docs scenes tests -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean
 	rm -rf $(VENV) $(VENV)-virtualenv $(VENV)-distributed $(VENV)-distributed-virtualenv

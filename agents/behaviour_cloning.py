@@ -11,9 +11,9 @@ from pathlib import Path
 import minari
 import numpy as np
 
-from surgsim_env.training.fit import fit
-from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
-from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_apps.training.fit import fit
+from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -4,8 +4,8 @@
     python -m agents.learn_from_scratch retract --seed 2    # two hours
     surgsim evaluate --policy runs/palpate-seed0/policy.json
 
-Palpation plays a surrogate with a force formula (`surgsim_env.training.palpate_surrogate`), retraction 16 lobes side by
-side. The run's folder holds checkpoints (pickles: resume only runs of your own), for each start `progress.csv` and
+Palpation plays a surrogate with a force formula (`surgsim_apps.training.palpate_surrogate`), retraction 16 lobes side
+by side. The run's folder holds checkpoints (pickles: resume only runs of your own), for each start `progress.csv` and
 `evaluations.npz` of the periodic evaluations, and at the end the policy. The same command resumes a run that was
 stopped.
 """
@@ -24,12 +24,12 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
-from surgsim_env.training.curriculum import RepeatedAction, Stage, StagedRewards
-from surgsim_env.training.palpate_surrogate import PalpateSurrogate
-from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, save_policy
-from surgsim_env.training.policy_network import NetworkLayout, actor_of
-from surgsim_env.training.touch_features import TouchSummary
+from surgsim_apps.training.curriculum import RepeatedAction, Stage, StagedRewards
+from surgsim_apps.training.palpate_surrogate import PalpateSurrogate
+from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, save_policy
+from surgsim_apps.training.policy_network import NetworkLayout, actor_of
+from surgsim_apps.training.touch_features import TouchSummary
+from surgsim_env import VectorEnvForStableBaselines
 
 ENVS, REPEAT = 16, 5
 # Of each periodic evaluation.

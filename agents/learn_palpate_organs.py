@@ -2,10 +2,10 @@
 
     python -m agents.learn_palpate_organs --out runs/palpate_organs.json
 
-The network sees the observation alone, through `surgsim_env.training.face_features.FaceSummary`. It is fitted to
+The network sees the observation alone, through `surgsim_apps.training.face_features.FaceSummary`. It is fitted to
 imagined features, which fill their ranges, and to the states that it reaches on organs whose forces a formula gives
-(`surgsim_env.training.face_surrogate`), all labelled by the expert (`surgsim_env.scoring.expert_organs`). Features are
-kept in place of observations of 5069 numbers.
+(`surgsim_apps.training.face_surrogate`), all labelled by the expert (`surgsim_apps.scoring.expert_organs`). Features
+are kept in place of observations of 5069 numbers.
 """
 
 import argparse
@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
-from surgsim_env.training.face_features import (
+from surgsim_apps.scoring.expert_organs import DEPTH, expert_actions
+from surgsim_apps.training.face_features import (
     LATE,
     SUMMARY_SIZE,
     WAY_MOST,
@@ -26,10 +26,10 @@ from surgsim_env.training.face_features import (
     face_features,
     face_summary,
 )
-from surgsim_env.training.face_surrogate import FaceSurrogate
-from surgsim_env.training.fit import fit
-from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
-from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_apps.training.face_surrogate import FaceSurrogate
+from surgsim_apps.training.fit import fit
+from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
 
 ENV_ID = "SurgSim/Palpate-v0"
 BATCH = 512

@@ -22,11 +22,11 @@ import torch
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.rendering.looks import draw_look, find_look_ranges
-from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
-from surgsim_env.training.fit import fit
-from surgsim_env.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
-from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
+from surgsim_apps.training.fit import fit
+from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_env.rendering import draw_look, find_look_ranges
 
 ID = "SurgSim/Retract-v0"
 PICTURES: dict[str, Any] = {"obs_mode": "rgb_force", "looks": "train"}

@@ -4,7 +4,7 @@
         --check-faces agents/faces/phantom_standard_held.npz --out runs/sites.json
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
-`cma`) changes the 13 numbers of `surgsim_env.training.acquisition.Acquisition`, beginning at the upper confidence
+`cma`) changes the 13 numbers of `surgsim_apps.training.acquisition.Acquisition`, beginning at the upper confidence
 bound of `gp_ucb`. All candidates of a generation play the same episodes on faces that
 `agents.record_faces` has recorded, as many of each recording, with `--weights` in the cost; each generation has new
 ones. Processes share the episodes. An episode costs
@@ -36,18 +36,17 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.palpation.scores import CUTOFF, ERROR_LINE
-from surgsim_env.training.acquisition import Acquisition
-from surgsim_env.training.policy_files import (
+from surgsim_apps.training.acquisition import Acquisition
+from surgsim_apps.training.policy_files import (
     PolicyDescription,
     observation_declaration,
     policy_path,
     save_policy,
 )
-from surgsim_env.training.recorded_faces import load_faces
-from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
-from surgsim_env.training.site_surrogate import SiteSurrogate, SurrogateFace
+from surgsim_apps.training.recorded_faces import load_faces
+from surgsim_apps.training.site_agent import GrowingBelief, SiteProcess, observed_facts
+from surgsim_apps.training.site_surrogate import SiteSurrogate, SurrogateFace
+from surgsim_env.palpation import CUTOFF, ERROR_LINE, MAP_SIDE
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
 # From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.

@@ -13,8 +13,8 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from agents.envhub.env import NAMES, describe_task
-from surgsim_env.envs.palpate_sites_env import PalpateSitesEnv
-from surgsim_env.instruments.arm.pair import SIDES, Pair
+from surgsim_env.envs import PalpateSitesEnv
+from surgsim_env.instruments import SIDES, Pair
 
 STATE, WRENCH = NAMES.values()
 WRENCH_NAMES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")

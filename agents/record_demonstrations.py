@@ -35,14 +35,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.palpation.scores import EVALUATION_SEEDS
-from surgsim_env.rendering.gl import NoGLError
-from surgsim_env.rendering.options import CAMERAS
-from surgsim_env.scene.digest import PHYSICS_VERSION
-from surgsim_env.scoring.episodes import EpisodeActor, agent_generator
-from surgsim_env.scoring.evaluate import strangers_actor
-from surgsim_env.scripting import ScriptError, oracle_script, run_script
-from surgsim_env.scripting.observations import stacked_observations
+from surgsim_apps.scoring.episodes import EpisodeActor, agent_generator
+from surgsim_apps.scoring.evaluate import strangers_actor
+from surgsim_env.palpation import EVALUATION_SEEDS
+from surgsim_env.rendering import CAMERAS, NoGLError
+from surgsim_env.scene import PHYSICS_VERSION
+from surgsim_env.scripting import ScriptError, oracle_script, run_script, stacked_observations
 
 CODE = "agents/record_demonstrations.py of surgsim"
 POLICY_SUFFIXES = (".json", ".safetensors")
@@ -154,7 +152,7 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     if by == "oracle":
         return play_oracle
     if by.endswith(POLICY_SUFFIXES):
-        from surgsim_env.training.policy_files import load_policy
+        from surgsim_apps.training.policy_files import load_policy
 
         policy = load_policy(Path(by))
         policy.check_environment(env, f"policy {by}")

@@ -8,7 +8,7 @@ Of `liver_family`, 128 faces take 80 to 120 minutes of processor time.
 import argparse
 from pathlib import Path
 
-from surgsim_env.training.recorded_faces import LANES, record_faces
+from surgsim_apps.training.recorded_faces import LANES, record_faces
 
 
 def main() -> None:

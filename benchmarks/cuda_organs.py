@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from numba import cuda
 
-from msdm_core.cuda.organs import DeviceOrgans
-from msdm_core.kernels.structure_kernels import ContactShapes, ToolResponse
-from msdm_core.lanes.lanes import stack_shapes
-from msdm_core.organ.compile import rest_state
-from msdm_core.organ.stepping import advance_organ, round_shapes, unyielding
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.load import make_scene
+from msdm_core.cuda import DeviceOrgans
+from msdm_core.kernels import ContactShapes, ToolResponse
+from msdm_core.lanes import stack_shapes
+from msdm_core.organ import advance_organ, rest_state, round_shapes, unyielding
+from surgsim_env.scene import Anatomy, load_anatomy, make_scene
 
 # Scene, lanes, options of `DeviceOrgans`, haptic steps in a launch, in the order in which they matter.
 ROWS: list[tuple[str, int, dict[str, Any], int]] = [

@@ -18,12 +18,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from msdm_core.material.regions import Lesion
-from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.job import MODEL_MODULUS_ERROR, PalpationResult, plan_sites, run_palpation
-from surgsim_env.palpation.scene_options import load_stable_anatomy
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.load import load_scene
+from msdm_core.material import Lesion
+from msdm_core.mesh import FloatArray
+from surgsim_apps.palpate.job import MODEL_MODULUS_ERROR, PalpationResult, plan_sites, run_palpation
+from surgsim_apps.palpate.scene_options import load_stable_anatomy
+from surgsim_env.scene import Anatomy, load_anatomy, load_scene
 
 RATIO = 8.0
 RADIUS_SHARE, RADIUS_RANGE = 0.173, (0.010, 0.019)

@@ -38,7 +38,7 @@ from numpy.random import Generator
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 # Packages whose errors are refusals.
-OURS = ("msdm_core", "surgsim_env")
+OURS = ("msdm_core", "surgsim_env", "surgsim_apps")
 SECONDS_MOST = 60.0  # for one input
 ADDRESS_SPACE = 16_000_000_000  # of the worker [bytes]: a table for an odd count is refused at once
 START_SECONDS = 600.0  # for the worker's start, which imports libraries
@@ -77,9 +77,9 @@ def mesh_cases(folder: Path) -> Iterator[Files]:
     import meshio
     import trimesh
 
-    from msdm_core.mesh.tet_mesh import TetMesh
-    from msdm_core.mesh_files.mesh_io import write_mesh
-    from msdm_core.meshing.lattice_meshing import box_mesh
+    from msdm_core.mesh import TetMesh
+    from msdm_core.mesh_files import write_mesh
+    from msdm_core.meshing import box_mesh
 
     block = box_mesh((0.04, 0.03, 0.02), (4, 3, 2))
     region = (block.points[block.tets].mean(axis=1)[:, 0] > 0.02).astype(np.int32)
@@ -96,15 +96,14 @@ def mesh_cases(folder: Path) -> Iterator[Files]:
 
 def cells_of(size: float) -> Any:
     """Cells of one size [m]."""
-    from surgsim_env.patient.meshers import Cells
+    from surgsim_apps.patient.meshers import Cells
 
     return Cells(size, is_given=True, coarsening=1, fine_depth=0.0, approach=(0.0, 0.0, -1.0), face_angle_deg=60.0)
 
 
 def read_mesh_file(path: Path) -> object:
-    from msdm_core.mesh_files.mesh_io import read_mesh
-    from msdm_core.mesh_files.surface_io import SURFACE_SUFFIXES
-    from surgsim_env.patient.meshers import mesh_surfaces, read_surfaces
+    from msdm_core.mesh_files import SURFACE_SUFFIXES, read_mesh
+    from surgsim_apps.patient.meshers import mesh_surfaces, read_surfaces
 
     if path.suffix in SURFACE_SUFFIXES:
         return mesh_surfaces(read_surfaces([path], "m", mend=False), cells=cells_of(0.01), mesher="lattice")
@@ -112,15 +111,14 @@ def read_mesh_file(path: Path) -> object:
 
 
 def scene_cases(_folder: Path) -> Iterator[Files]:
-    from surgsim_env.scene.load import scenes_folder
+    from surgsim_env.scene import scenes_folder
 
     for name in ("phantom_small", "phantom", "lobe", "agarose_prism", "bovine_liver_block"):
         yield {f"{name}.toml": (scenes_folder() / "organs" / f"{name}.toml").read_bytes()}
 
 
 def read_scene(path: Path) -> object:
-    from surgsim_env.scene.anatomy import load_anatomy
-    from surgsim_env.scene.load import make_scene
+    from surgsim_env.scene import load_anatomy, make_scene
 
     anatomy = load_anatomy(make_scene(path))
     return anatomy.organ(anatomy.demonstration_lesions())
@@ -149,15 +147,15 @@ def image_cases(folder: Path) -> Iterator[Files]:
 
 
 def read_image(path: Path) -> object:
-    from surgsim_env.patient.label_image import parse_labels, read_label_image
-    from surgsim_env.patient.meshers import mesh_image
+    from surgsim_apps.patient.label_image import parse_labels, read_label_image
+    from surgsim_apps.patient.meshers import mesh_image
 
     image = read_label_image(path, parse_labels("liver=1,lesion=2"))
     return mesh_image(image, path.name, cells=cells_of(0.012), mesher="lattice", mend=True)
 
 
 def arm_cases(_folder: Path) -> Iterator[Files]:
-    from surgsim_env.scene.load import scenes_folder
+    from surgsim_env.scene import scenes_folder
 
     instruments = scenes_folder() / "instruments"
     for name in ("psm_palpator", "psm_grasper", "psm_retractor", "six_axis"):
@@ -165,7 +163,7 @@ def arm_cases(_folder: Path) -> Iterator[Files]:
 
 
 def read_arm(path: Path) -> object:
-    from surgsim_env.instruments.arm.arm import load_arm
+    from surgsim_env.instruments import load_arm
 
     arm = load_arm(path)
     return arm.tip_pose(arm.home)
@@ -179,7 +177,7 @@ def csv_cases(folder: Path) -> Iterator[Files]:
 
 
 def read_csv(path: Path) -> object:
-    from surgsim_env.haptics.trajectory import TrajectoryDevice
+    from surgsim_apps.haptics.trajectory import TrajectoryDevice
 
     return TrajectoryDevice.load(path).read()
 

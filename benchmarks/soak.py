@@ -38,9 +38,9 @@ from rich.console import Console
 from rich.table import Table
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.bench.report import describe, load
-from surgsim_env.coupling.lane_group import core_count
-from surgsim_env.scene.levels import LEVELS
+from surgsim_apps.bench.report import describe, load
+from surgsim_env.coupling import core_count
+from surgsim_env.scene import LEVELS
 
 # What each id is played with.
 CASES: dict[str, dict[str, tuple[Any, ...]]] = {

@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image
 
 import surgsim_env  # noqa: F401  (registers the environments)
-from surgsim_env.envs.surgical_env import SurgicalEnv
-from surgsim_env.reports.output_folder import output_folder
+from surgsim_apps.reports.output_folder import output_folder
+from surgsim_env.envs import SurgicalEnv
 from surgsim_env.scripting import oracle_script, run_script
 
 IMAGES = Path(__file__).parent / "images"

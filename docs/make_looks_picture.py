@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import surgsim_env  # noqa: F401  (registers the environments)
-from surgsim_env.rendering.looks import LOOK_SPLITS, draw_look, look_generator
+from surgsim_env.rendering import LOOK_SPLITS, draw_look, look_generator
 from surgsim_env.scripting import oracle_script, run_script
 
 IMAGES = Path(__file__).parent / "images"

@@ -8,12 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.coupling.motion import draw_drive, signals
-from surgsim_env.coupling.tracking import SurfaceTracker
-from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.motions import with_motion
-from surgsim_env.scripting import Hold, PressUntil, run_script
-from surgsim_env.scripting.steps import Tracked
+from surgsim_env.coupling import SurfaceTracker, draw_drive, signals
+from surgsim_env.scene import make_scene, with_motion
+from surgsim_env.scripting import Hold, PressUntil, Tracked, run_script
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = {"calm": "#0072B2", "free": "#D55E00"}

@@ -7,15 +7,13 @@ import numpy as np
 from PIL import Image
 from rich.console import Console
 
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.envs.surgical_env import SurgicalEnv
-from surgsim_env.palpation.figures import write_organ_picture
-from surgsim_env.palpation.job import run_palpation
-from surgsim_env.rendering.options import RenderOptions
-from surgsim_env.rendering.renderer import OrganRenderer
-from surgsim_env.reports.output_folder import output_folder
-from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_apps.palpate.figures import write_organ_picture
+from surgsim_apps.palpate.job import run_palpation
+from surgsim_apps.reports.output_folder import output_folder
+from surgsim_env.coupling import Simulation
+from surgsim_env.envs import SurgicalEnv
+from surgsim_env.rendering import OrganRenderer, RenderOptions
+from surgsim_env.scene import load_anatomy, make_scene
 from surgsim_env.scripting import Hold, Lift, MoveTo, PressUntil, oracle_script, run_script
 
 IMAGES = Path(__file__).parent / "images"

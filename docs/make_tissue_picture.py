@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from msdm_core import Damping, Lesion, Material, OrganSpec, box_mesh, compile_organ
-from msdm_core.kernels.structure_kernels import ContactLaw
-from msdm_core.organ.compile import rest_state
-from msdm_core.organ.stability import stable_dt
-from msdm_core.organ.stepping import advance, round_shapes
+from msdm_core.kernels import ContactLaw
+from msdm_core.organ import advance, rest_state, round_shapes, stable_dt
 from surgsim_env import make_material
 
 IMAGES = Path(__file__).parent / "images"

@@ -15,6 +15,26 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.kernels.matrix_kernels import diagonalise, eliminate, multiply, orthogonalise
 from msdm_core.kernels.structure_kernels import FloatArray
 
+__all__ = [
+    "arccos",
+    "arctan2",
+    "cbrt",
+    "cos",
+    "dot",
+    "eigh",
+    "exp",
+    "expm1",
+    "log",
+    "log1p",
+    "lstsq",
+    "matmul",
+    "norm",
+    "power",
+    "sin",
+    "solve",
+    "svd",
+]
+
 # ln 2 and pi / 2 in parts; a small whole number times any but the last part is exact.
 LN2 = (0.693147180369123816490, 1.90821492927058770002e-10)
 HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)

@@ -1,5 +1,7 @@
 """The errors of the organ model: each says what is wrong, which element, the value, the rule and the way out."""
 
+__all__ = ["MeshError", "OrganDivergedError", "OrganError"]
+
 
 class MeshError(ValueError):
     """A surface or tetrahedral mesh that cannot become an organ."""

@@ -24,6 +24,8 @@ import platformdirs
 from numba.core import config, dispatcher, event
 from numba.core.caching import FunctionCache
 
+__all__ = ["FOLDER_PREFIX", "kernel_cache"]
+
 LOGGER = logging.getLogger("msdm_core")
 KERNEL_FILES = "*kernels.py"
 FOLDER_PREFIX = "surgsim-kernels-"

@@ -1,7 +1,8 @@
 """The import graph of the project, read from the source; `python -m tests.architecture --graph` prints it.
 
-A room is a first-level folder or a loose file of `surgsim_env`, or one of `msdm_core`, `agents`, `benchmarks` and
-`scenes`. Every import counts: at the top of a file, inside a function, under TYPE_CHECKING.
+The rooms at the top are the packages; the rooms of a package are its folders and loose files. Every import counts: at
+the top of a file, inside a function, under TYPE_CHECKING. Applications, agents and benchmarks may import from the
+engine (`msdm_core`, `surgsim_env`) only names in the `__all__` of the engine's packages and their rooms.
 """
 
 import ast
@@ -12,48 +13,32 @@ from functools import cache
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PACKAGES = ("msdm_core", "surgsim_env", "agents", "benchmarks", "scenes")
+PACKAGES = ("msdm_core", "surgsim_env", "surgsim_apps", "agents", "benchmarks", "scenes")
 
-# From the ground up: each imports only what stands before it. The package's own file registers the ids of the
-# environments and offers the public names; the rooms of the package never import it.
+ENGINE = ("msdm_core", "surgsim_env")
+APPLICATIONS = ("surgsim_apps", "agents", "benchmarks")
+
+# From the ground up: each imports only what stands before it. A package's own file offers the public names.
 ORDER = {
+    "": ("msdm_core", "surgsim_env", "surgsim_apps", "scenes", "agents", "benchmarks"),
+    "msdm_core": (
+        *("errors", "numba_cache", "kernels", "arithmetic", "mesh", "mesh_files", "material", "meshing", "organ"),
+        *("lanes", "cuda", "__init__"),
+    ),
     "surgsim_env": (
-        *("reports", "scene", "instruments", "coupling", "haptics", "palpation", "tasks", "identify", "validation"),
-        *("rendering", "patient", "envs", "live", "scripting", "training", "scoring", "bench", "arm_study", "cli"),
+        *("step_progress", "scene", "instruments", "coupling", "palpation", "tasks", "rendering", "envs", "scripting"),
         "__init__",
     ),
-    "msdm_core": (
-        *(
-            "errors",
-            "numba_cache",
-            "kernels",
-            "arithmetic",
-            "mesh",
-            "mesh_files",
-            "material",
-            "meshing",
-            "organ",
-            "lanes",
-            "cuda",
-        ),
-        "__init__",
+    "surgsim_apps": (
+        *("__init__", "reports", "palpate", "patient", "identify", "validation", "haptics", "live", "training"),
+        *("scoring", "bench", "arms", "cli"),
     ),
     # One script each.
     "agents": (
-        *("__init__", "record_faces", "learn_from_scratch"),
-        *("learn_palpate_organs", "learn_retract", "learn_sites"),
-        *(
-            "envhub",
-            "lerobot_dataset",
-            "record_demonstrations",
-            "behaviour_cloning",
-            "train_rllib",
-            "leaderboard",
-        ),
+        *("__init__", "record_faces", "learn_from_scratch", "learn_palpate_organs", "learn_retract", "learn_sites"),
+        *("envhub", "lerobot_dataset", "record_demonstrations", "behaviour_cloning", "train_rllib", "leaderboard"),
     ),
-    "": ("msdm_core", "surgsim_env", "scenes", "agents", "benchmarks"),
 }
-MOST_ROOMS = 24
 
 
 def module_files() -> dict[str, Path]:
@@ -103,10 +88,13 @@ def room(module: str, package: str) -> str:
 
 
 def room_imports(package: str) -> dict[str, set[str]]:
-    """For each room of a package (of all packages where it is empty), the other rooms that it imports."""
+    """For each room of a package (of all packages where it is empty), the other rooms that it imports.
+
+    A package's own file is no room: it offers names of all of them.
+    """
     rooms: dict[str, set[str]] = defaultdict(set)
     for module, imports in file_imports().items():
-        if package and not module.startswith(f"{package}."):
+        if package and (not module.startswith(f"{package}.") or module == f"{package}.__init__"):
             continue
         inside = (name for name in imports if not package or name.startswith(f"{package}."))
         own = room(module, package)
@@ -137,7 +125,7 @@ def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
     index: dict[str, int] = {}
     low: dict[str, int] = {}
     stack: list[str] = []
-    found: list[list[str]] = []
+    groups: list[list[str]] = []
 
     def visit(node: str) -> None:
         index[node] = low[node] = len(index)
@@ -153,36 +141,86 @@ def cycles(graph: dict[str, set[str]]) -> list[list[str]]:
             while not group or group[-1] != node:
                 group.append(stack.pop())
             if len(group) > 1:
-                found.append(sorted(group))
+                groups.append(sorted(group))
 
     for node in graph:
         if node not in index:
             visit(node)
-    return found
+    return groups
 
 
-def rooms() -> list[str]:
-    """All rooms of the project."""
-    return sorted(room_imports("surgsim_env")) + [name for name in PACKAGES if name != "surgsim_env"]
+def floors(graph: dict[str, set[str]]) -> int:
+    """Number of rooms on the longest way down a graph without cycles."""
+
+    @cache
+    def height(name: str) -> int:
+        return 1 + max((height(lower) for lower in graph.get(name, ())), default=0)
+
+    return max(map(height, graph))
+
+
+@cache
+def exported_names() -> dict[str, set[str]]:
+    """The `__all__` of each engine package and each of its rooms, by dotted name."""
+    names = {}
+    for module, path in module_files().items():
+        package = module.removesuffix(".__init__")
+        if package.split(".")[0] in ENGINE and package.count(".") <= 1:
+            names[package] = set(declared_names(path.read_text(encoding="utf-8")))
+    return names
+
+
+def declared_names(text: str) -> list[str]:
+    """The `__all__` of a source text, empty without one."""
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return ast.literal_eval(node.value)
+    return []
+
+
+def unexported_imports(text: str) -> Iterator[str]:
+    """Imports from the engine in a source text, other than of an exported name or of a room as `import ROOM`."""
+    exported = exported_names()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ENGINE:
+            for alias in node.names:
+                if alias.name not in exported.get(node.module, ()):
+                    yield f"{node.module}.{alias.name}"
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.split(".")[0] in ENGINE and alias.name not in exported:
+                    yield alias.name
+
+
+def applications_unexported() -> list[str]:
+    """Names of the engine that applications import although no room exports them: "module: name"."""
+    return [
+        f"{module}: {name}"
+        for module, path in module_files().items()
+        if module.split(".")[0] in APPLICATIONS
+        for name in unexported_imports(path.read_text(encoding="utf-8"))
+    ]
 
 
 def main() -> None:
-    """Print the rooms of both packages with what they import, the cycles, and the counts."""
+    """Print the rooms of each package with their imports, the counts, the cycles and imports of unexported names."""
     if "--graph" not in sys.argv[1:]:
         sys.exit("usage: python -m tests.architecture --graph")
-    for package in ("", "msdm_core", "surgsim_env", "agents"):
+    for package, order in ORDER.items():
         graph = room_imports(package)
-        print(f"{package or 'repository'}:")
-        for name in (*(item for item in ORDER[package] if item in graph), *sorted(set(graph) - set(ORDER[package]))):
-            print(f"  {name:12} <- {', '.join(item for item in ORDER[package] if item in graph[name]) or '-'}")
+        arrows = sum(map(len, graph.values()))
+        print(f"{package or 'top'}: {len(graph)} rooms, {floors(graph)} floors, {arrows} arrows")
+        for name in (*(room for room in order if room in graph), *sorted(set(graph) - set(order))):
+            print(f"  {name:13} <- {', '.join(room for room in order if room in graph[name]) or '-'}")
         for fault in against_order(package):
             print(f"  against the order: {fault}")
-    files = file_imports()
-    print(f"{len(rooms())} rooms (at most {MOST_ROOMS}), {len(files)} files, {sum(map(len, files.values()))} imports")
-    for group in cycles(files):
-        print("cycle of files:", ", ".join(group))
-    if not cycles(files):
-        print("no cycle between files")
+    files, groups, unexported = file_imports(), cycles(file_imports()), applications_unexported()
+    print(f"{len(files)} files, {sum(map(len, files.values()))} imports, {len(groups)} cycles between files")
+    for group in groups:
+        print("  cycle:", ", ".join(group))
+    print(f"{len(unexported)} imports of engine names that are not exported, in {', '.join(APPLICATIONS)}")
+    for line in unexported:
+        print(f"  {line}")
 
 
 if __name__ == "__main__":

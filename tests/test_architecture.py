@@ -19,7 +19,7 @@ from msdm_core import numba_cache
 from tests import architecture
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PACKAGES = ("msdm_core", "surgsim_env")
+PACKAGES = ("msdm_core", "surgsim_env", "surgsim_apps")
 
 # numba's disk cache does not see edits in other files: what is compiled, the structures and the constants it reads
 # stand in these, whose text names the cache's folder (`numba_cache.kernel_cache`); they import nothing else of ours.
@@ -34,25 +34,21 @@ MUJOCO_CALLS = "surgsim_env/instruments/mujoco_kernels.py"
 # May import numba, though nothing in it is compiled.
 NUMBA_SETTINGS = ("msdm_core/numba_cache.py",)
 
-# Rooms of surgsim_env that may import gymnasium.
-GYMNASIUM_ROOMS = {"__init__", "tasks", "envs", "live", "scripting", "training", "scoring", "bench", "arm_study", "cli"}
-# Rooms that few import, and which do.
-TOPS = {
-    "validation": {"bench", "cli"},
-    "live": {"cli"},
-    "scripting": {"scoring", "arm_study", "cli"},
-    "training": {"scoring"},
-    "scoring": {"cli"},
-    "bench": {"cli"},
-    "arm_study": {"cli"},
-    "cli": set(),
+# Rooms that may import gymnasium.
+GYMNASIUM_ROOMS = {
+    *(f"surgsim_env/{room}" for room in ("__init__", "tasks", "envs", "scripting")),
+    *(f"surgsim_apps/{room}" for room in ("live", "training", "scoring", "bench", "arms", "cli")),
 }
 
 # What decides an episode or what it shows: organs, motion, draws, observations, presses, estimates, scripts, scores.
 DECIDING = (
     "msdm_core/",
-    *(f"surgsim_env/{room}/" for room in ("scene", "patient", "instruments", "coupling", "tasks", "envs", "palpation")),
-    *("surgsim_env/scripting/", "surgsim_env/scoring/", "surgsim_env/training/site_agent.py"),
+    *(
+        f"surgsim_env/{room}/"
+        for room in ("scene", "instruments", "coupling", "tasks", "envs", "palpation", "scripting")
+    ),
+    *(f"surgsim_apps/{room}/" for room in ("patient", "palpate", "scoring")),
+    *(f"surgsim_apps/{file}.py" for file in ("training/site_agent", "arms/find_arm", "arms/survey")),
 )
 # numpy picks these by processor (its own code for AVX-512, BLAS), the C library's differ by version. `math.hypot` and
 # `math.dist` are Python's own, of + * and square roots.
@@ -76,21 +72,13 @@ UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
     "msdm_core/material/tissue_law.py": (("sum",), "arrays"),
     "msdm_core/meshing/segmentation_meshing.py": (("sum",), "whole numbers"),
     "surgsim_env/instruments/arm/arm_instrument.py": (("sum",), "whole numbers"),
-    "surgsim_env/palpation/contrast_map.py": (("sum", "scipy.optimize"), "counts; the assignment only compares"),
-    "surgsim_env/palpation/figures.py": (("np.sin", "np.cos", "np.linalg.norm", "np.linalg"), "pictures"),
+    "surgsim_apps/palpate/contrast_map.py": (("sum", "scipy.optimize"), "counts; the assignment only compares"),
+    "surgsim_apps/palpate/figures.py": (("np.sin", "np.cos", "np.linalg.norm", "np.linalg"), "pictures"),
     "surgsim_env/palpation/scores.py": (("scipy.optimize",), "the assignment only adds and compares"),
-    "surgsim_env/palpation/surface_drawing.py": (
-        (
-            *("@", "**", "np.einsum", "np.sin", "np.cos", "np.linalg", "np.linalg.norm"),
-            "np.linalg.svd",
-            "scipy.interpolate",
-        ),
-        "pictures",
-    ),
-    "surgsim_env/patient/label_image.py": (("sum",), "counts"),
-    "surgsim_env/patient/lesion_room.py": (("sum",), "counts"),
+    "surgsim_apps/patient/label_image.py": (("sum",), "counts"),
+    "surgsim_apps/patient/lesion_room.py": (("sum",), "counts"),
     "surgsim_env/scene/model.py": (("sum",), "counts"),
-    "surgsim_env/scoring/site_search.py": (("scipy.stats",), "Sobol's sequence, of whole numbers"),
+    "surgsim_apps/scoring/site_search.py": (("scipy.stats",), "Sobol's sequence, of whole numbers"),
     "surgsim_env/scripting/run.py": (("sum",), "counts"),
 }
 
@@ -174,7 +162,7 @@ def core_stands_alone(source: Source) -> Iterator[str]:
     """msdm_core knows neither MuJoCo nor Gymnasium nor the environments."""
     if source.path.startswith("msdm_core/"):
         for name, line in imported(source.tree):
-            if name.split(".")[0] in {"mujoco", "gymnasium", "surgsim_env"}:
+            if name.split(".")[0] in {"mujoco", "gymnasium", "surgsim_env", "surgsim_apps"}:
                 yield f"line {line} imports {name}"
 
 
@@ -286,8 +274,8 @@ def tasks_do_not_advance(source: Source) -> Iterator[str]:
 
 def gymnasium_stays_above(source: Source) -> Iterator[str]:
     """Scenes, instruments, simulation, haptics, palpation, pictures and patients know no environment."""
-    room = source.path.split("/")[1].removesuffix(".py")
-    if source.path.startswith("surgsim_env/") and room not in GYMNASIUM_ROOMS:
+    room = "/".join(source.path.split("/")[:2]).removesuffix(".py")
+    if not source.path.startswith("msdm_core/") and room not in GYMNASIUM_ROOMS:
         for name, line in imported(source.tree):
             if name.split(".")[0] == "gymnasium":
                 yield f"line {line} imports {name}"
@@ -295,19 +283,9 @@ def gymnasium_stays_above(source: Source) -> Iterator[str]:
 
 def patients_are_data(source: Source) -> Iterator[str]:
     """What makes an organ of a scan writes a scene; it runs no simulation."""
-    if source.path.startswith("surgsim_env/patient/"):
+    if source.path.startswith("surgsim_apps/patient/"):
         for name, line in imported(source.tree):
             if name.split(".")[0] == "mujoco" or name.startswith("surgsim_env.coupling"):
-                yield f"line {line} imports {name}"
-
-
-def tops_stand_alone(source: Source) -> Iterator[str]:
-    """Rooms at the top (a live session, an arm study, timings) are imported by the rooms in TOPS only."""
-    room = source.path.split("/")[1].removesuffix(".py")
-    if source.path.startswith("surgsim_env/"):
-        for name, line in imported(source.tree):
-            other = name.split(".")[1] if name.startswith("surgsim_env.") else ""
-            if other in TOPS and room not in {other, *TOPS[other]}:
                 yield f"line {line} imports {name}"
 
 
@@ -329,7 +307,6 @@ RULES: tuple[Callable[[Source], Iterator[str]], ...] = (
     tasks_do_not_advance,
     gymnasium_stays_above,
     patients_are_data,
-    tops_stand_alone,
     named_for_what_it_does,
 )
 
@@ -397,7 +374,7 @@ PLANTED = [
     (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "a = b.dot(c)"),
     (rounding_is_fixed, "surgsim_env/tasks/palpate.py", "a = sum(rewards)"),
     (rounding_is_fixed, "surgsim_env/instruments/arm/steering.py", "a = np.einsum('ij,j->i', b, c)"),
-    (rounding_is_fixed, "surgsim_env/scoring/site_search.py", "a = np.exp(b)"),
+    (rounding_is_fixed, "surgsim_apps/scoring/site_search.py", "a = np.exp(b)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "def judge(simulation):\n    simulation.haptic_step()"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "env.step(action)"),
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "simulation.control_step(50)"),
@@ -405,11 +382,9 @@ PLANTED = [
     (tasks_do_not_advance, "surgsim_env/tasks/palpate.py", "mujoco.mj_step1(model, data)"),
     (tasks_do_not_advance, "surgsim_env/rendering/stage.py", "mujoco.mj_step(model, data)"),
     (gymnasium_stays_above, "surgsim_env/instruments/arm/arm.py", "def late():\n    import gymnasium"),
-    (gymnasium_stays_above, "surgsim_env/haptics/loop.py", "from gymnasium.spaces import Box"),
-    (patients_are_data, "surgsim_env/patient/report.py", "from surgsim_env.coupling.simulation import Simulation"),
-    (patients_are_data, "surgsim_env/patient/retract_scene.py", "def late():\n    import mujoco"),
-    (tops_stand_alone, "surgsim_env/envs/ids.py", "from surgsim_env.scripting.run import run_script"),
-    (tops_stand_alone, "surgsim_env/haptics/loop.py", "from surgsim_env.live.session import Session"),
+    (gymnasium_stays_above, "surgsim_apps/haptics/loop.py", "from gymnasium.spaces import Box"),
+    (patients_are_data, "surgsim_apps/patient/report.py", "from surgsim_env.coupling.simulation import Simulation"),
+    (patients_are_data, "surgsim_apps/patient/retract_scene.py", "def late():\n    import mujoco"),
     (named_for_what_it_does, "msdm_core/mesh_utils.py", ""),
     (named_for_what_it_does, "surgsim_env/helpers/__init__.py", ""),
 ]
@@ -435,11 +410,10 @@ ALLOWED = [
         "@njit(fastmath=False)\ndef f(x): return math.sqrt(x)",
     ),
     (rounding_is_fixed, "msdm_core/organ/compile.py", "a = np.sqrt(b * b).sum() + math.fsum(c) + 2**d"),
-    (rounding_is_fixed, "surgsim_env/arm_study/reach.py", "a = b @ c"),
+    (rounding_is_fixed, "surgsim_apps/arms/reach.py", "a = b @ c"),
     (tasks_do_not_advance, "surgsim_env/envs/ids.py", "simulation.haptic_step()"),
     (gymnasium_stays_above, "surgsim_env/envs/vector_env.py", "import gymnasium"),
-    (patients_are_data, "surgsim_env/cli/organ.py", "from surgsim_env.coupling.simulation import Simulation"),
-    (tops_stand_alone, "surgsim_env/cli/view.py", "from surgsim_env.live.session import Session"),
+    (patients_are_data, "surgsim_apps/cli/organ.py", "from surgsim_env.coupling.simulation import Simulation"),
     (named_for_what_it_does, "msdm_core/mesh_files/mesh_io.py", ""),
 ]
 
@@ -456,7 +430,10 @@ def test_allowed_source_passes(rule, path, text):
 
 @pytest.mark.parametrize(
     ("package", "unwanted"),
-    [("msdm_core", HEAVY | {"mujoco", "gymnasium", "surgsim_env"}), ("surgsim_env", HEAVY | {"rich"})],
+    [
+        ("msdm_core", HEAVY | {"mujoco", "gymnasium", "surgsim_env"}),
+        ("surgsim_env", HEAVY | {"rich", "surgsim_apps"}),
+    ],
 )
 def test_import_stays_light(package, unwanted):
     """In a fresh interpreter, the package brings none of the heavy libraries."""
@@ -478,19 +455,35 @@ def test_no_files_import_each_other():
     assert not architecture.cycles(architecture.file_imports())
 
 
-def test_rooms_are_few():
-    assert len(architecture.rooms()) <= architecture.MOST_ROOMS
+@pytest.mark.parametrize("package", ["", *PACKAGES], ids=lambda package: package or "top")
+def test_rooms_are_easy_to_see(package):
+    """A dozen rooms, eight floors and thirty arrows: what a reader can hold of one picture."""
+    graph = architecture.room_imports(package)
+    assert len(graph) <= 12
+    assert architecture.floors(graph) <= 8
+    assert sum(map(len, graph.values())) <= 30
+
+
+def test_applications_import_exported_names():
+    assert not architecture.applications_unexported()
+
+
+def test_planted_unexported_import_is_seen():
+    for text in ("from surgsim_env import make_scene", "import msdm_core"):
+        assert not list(architecture.unexported_imports(text))
+    for text in ("from surgsim_env.scene.load import list_scenes", "import msdm_core.mesh.surface"):
+        assert list(architecture.unexported_imports(text))
 
 
 def test_planted_imports_are_seen():
     """At whatever place an import stands, and as whatever it is written."""
-    files = dict.fromkeys(("surgsim_env.__init__", "surgsim_env.live.__init__", "surgsim_env.live.session"), Path())
-    for text in ("import surgsim_env.live.session", "from surgsim_env.live import session"):
-        assert set(architecture.imported_modules(text, files)) == {"surgsim_env.live.session"}
-    late = "def f():\n    from surgsim_env.live.session import Session"
-    typed = "if TYPE_CHECKING:\n    from surgsim_env.live.session import Session"
+    files = dict.fromkeys(("surgsim_env.__init__", "surgsim_apps.live.__init__", "surgsim_apps.live.session"), Path())
+    for text in ("import surgsim_apps.live.session", "from surgsim_apps.live import session"):
+        assert set(architecture.imported_modules(text, files)) == {"surgsim_apps.live.session"}
+    late = "def f():\n    from surgsim_apps.live.session import Session"
+    typed = "if TYPE_CHECKING:\n    from surgsim_apps.live.session import Session"
     for text in (late, typed):
-        assert set(architecture.imported_modules(text, files)) == {"surgsim_env.live.session"}
+        assert set(architecture.imported_modules(text, files)) == {"surgsim_apps.live.session"}
     assert set(architecture.imported_modules("from surgsim_env import make_scene", files)) == {"surgsim_env.__init__"}
 
 

@@ -32,13 +32,13 @@ from llvmlite.binding import get_host_cpu_features
 
 import msdm_core
 import surgsim_env
-from surgsim_env.palpation.contrast_map import contrast_with_neighbours, feel_lesions
-from surgsim_env.palpation.press import scan
+from surgsim_apps.palpate.contrast_map import contrast_with_neighbours, feel_lesions
+from surgsim_apps.scoring.site_search import AGENTS
+from surgsim_apps.training.site_agent import site_facts
+from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import MemberName
 from surgsim_env.scene.family import make_member
-from surgsim_env.scoring.site_search import AGENTS
 from surgsim_env.scripting import ScriptError, Trace, oracle_script, run_script
-from surgsim_env.training.site_agent import site_facts
 
 ROOT = Path(__file__).resolve().parents[1]
 HASHES = Path(__file__).with_name("unchanged_hashes.json")

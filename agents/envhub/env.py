@@ -15,7 +15,7 @@ from lerobot.envs.configs import EnvConfig
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.coupling.tip_wrench import tip_wrench
+from surgsim_env.coupling import tip_wrench
 
 # Without an id, all whose steps last one control step.
 IDS = ("SurgSim/Palpate-v0", "SurgSim/Retract-v0", "SurgSim/BimanualRetract-v0")

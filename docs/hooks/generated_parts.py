@@ -101,7 +101,7 @@ def command_list() -> str:
 
 def said(*arguments: str) -> str:
     """The output of the command line, with one line for each option."""
-    from surgsim_env.cli.main import main
+    from surgsim_apps.cli.main import main
 
     printed = io.StringIO()
     with mock.patch.dict(os.environ, COLUMNS), contextlib.redirect_stdout(printed):

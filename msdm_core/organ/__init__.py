@@ -1,1 +1,50 @@
 """Compiling an organ, its supports, its stable step, and advancing it."""
+
+from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, rest_state
+from msdm_core.organ.measure import (
+    contact_energy,
+    kinetic_energy,
+    node_strains,
+    potential_energy,
+    support_forces,
+    tissue_load,
+)
+from msdm_core.organ.motion import SIGNAL
+from msdm_core.organ.stability import contact_node_area, stable_dt
+from msdm_core.organ.stepping import (
+    NO_CONTACT,
+    NO_SHAPES,
+    advance,
+    advance_or_raise,
+    advance_organ,
+    describe_fault,
+    round_shapes,
+    unyielding,
+)
+from msdm_core.organ.support import Support, SupportLaw
+
+__all__ = [
+    "NO_CONTACT",
+    "NO_SHAPES",
+    "SIGNAL",
+    "OrganSpec",
+    "Support",
+    "SupportLaw",
+    "advance",
+    "advance_or_raise",
+    "advance_organ",
+    "blank_state",
+    "compile_organ",
+    "contact_energy",
+    "contact_node_area",
+    "describe_fault",
+    "kinetic_energy",
+    "node_strains",
+    "potential_energy",
+    "rest_state",
+    "round_shapes",
+    "stable_dt",
+    "support_forces",
+    "tissue_load",
+    "unyielding",
+]

@@ -10,7 +10,7 @@ from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.envs.surgical_env import Action, Info, SurgicalEnv
 from surgsim_env.envs.vector_env import LaneVectorEnv
 from surgsim_env.palpation.chart import Site
-from surgsim_env.palpation.press import PressPhase, SitePress, press_alone, press_in_lanes, press_phases
+from surgsim_env.palpation.site_press import PressPhase, SitePress, press_alone, press_in_lanes, press_phases
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 

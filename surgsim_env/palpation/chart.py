@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,16 +15,14 @@ from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import SitePress, in_threads, press_in_lanes, press_phases
-from surgsim_env.palpation.scene_options import with_substeps
-from surgsim_env.reports.output_folder import output_folder
-from surgsim_env.reports.step_progress import StepProgress
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass
+from surgsim_env.palpation.site_press import SitePress, in_threads, press_in_lanes, press_phases
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass, with_substeps
 from surgsim_env.scene.digest import PHYSICS_VERSION, content_digest
 from surgsim_env.scene.family import KEPT_MOST
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
+from surgsim_env.step_progress import StepProgress
 
 # Fewest and most sites on a side of the grid; an odd number has one in the middle.
 SITES_FEWEST, SITES_MOST = 13, 25
@@ -446,5 +445,8 @@ def cache_folder() -> Path:
 
 def keep_map(path: Path, grid: FloatArray) -> None:
     """Write the map atomically; a folder that is not writable is ignored."""
-    with contextlib.suppress(OSError), output_folder(path.parent) as files:
-        np.save(files / path.name, grid, allow_pickle=False)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            np.save(Path(folder, path.name), grid, allow_pickle=False)
+            os.replace(Path(folder, path.name), path)

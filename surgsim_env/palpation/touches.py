@@ -14,7 +14,7 @@ from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.bell_fit import BellFit, framed
 from surgsim_env.palpation.chart import ChartedFace, HealthyMap, Site
-from surgsim_env.palpation.press import PressResult
+from surgsim_env.palpation.site_press import PressResult
 from surgsim_env.scene.model import PalpationSettings, Scene
 from surgsim_env.scene.palpable_surface import hertz_force
 

@@ -1,1 +1,38 @@
 """Pictures of a simulation: colour, depth and labels of each pixel, off screen or in a window."""
+
+from surgsim_env.rendering import gl
+from surgsim_env.rendering.cameras import Camera, filling, scene_cameras
+from surgsim_env.rendering.embedding import organ_surface
+from surgsim_env.rendering.gl import NoGLError
+from surgsim_env.rendering.looks import LOOK_SPLITS, draw_look, find_look_ranges, look_generator
+from surgsim_env.rendering.options import CAMERAS, RenderOptions
+from surgsim_env.rendering.renderer import DrawnCapsule, OrganRenderer, draw_still
+from surgsim_env.rendering.scene_model import geom_colour, is_support, mesh_rows, shown_geoms
+from surgsim_env.rendering.surface import BEND, smooth_normals
+from surgsim_env.rendering.tissue import cut_edges, lesion_ball
+
+__all__ = [
+    "BEND",
+    "CAMERAS",
+    "LOOK_SPLITS",
+    "Camera",
+    "DrawnCapsule",
+    "NoGLError",
+    "OrganRenderer",
+    "RenderOptions",
+    "cut_edges",
+    "draw_look",
+    "draw_still",
+    "filling",
+    "find_look_ranges",
+    "geom_colour",
+    "gl",
+    "is_support",
+    "lesion_ball",
+    "look_generator",
+    "mesh_rows",
+    "organ_surface",
+    "scene_cameras",
+    "shown_geoms",
+    "smooth_normals",
+]

@@ -32,6 +32,8 @@ COVER_TOLERANCE = 1e-4
 SUPPORT_TIP_RADII = 2.0
 # Largest share of an organ's mass that may be added to save substeps, and the smallest number of substeps.
 ADDED_MASS_SHARE, SUBSTEPS_FEWEST = 0.01, 2
+# Limit of organ substeps in a haptic step: more would take hours.
+SUBSTEPS_MOST = 200
 # Cosines are exact to this where it is decided which way a surface faces.
 SIDE_ROUNDING = 1e-9
 
@@ -374,6 +376,25 @@ def with_added_mass(
             # One would need more than the limit of mass scaling.
             continue
     return replace(anatomy, scene=replace(anatomy.scene, timing=timing))
+
+
+def with_substeps(
+    anatomy: Anatomy, organs: Sequence[OrganModel], *, least: int = 1, most: float = SUBSTEPS_MOST
+) -> Anatomy:
+    """The anatomy with the number of substeps, and at least `least`, that is stable for all of some organs in contact.
+
+    Raises:
+        ValueError: more than `most` are needed.
+    """
+    scene = anatomy.scene
+    step = min(stable_dt(organ, scene.contact.law) for organ in organs)
+    count = max(substeps_needed(scene.timing.haptic_step, step), least)
+    if count > most:
+        raise ValueError(
+            f"this organ needs {count} substeps in {scene.timing.haptic_step:g} s, its stable step is {step:.3g} s; at "
+            f"most {most} are allowed: are the moduli in pascals? Else use larger cells"
+        )
+    return replace(anatomy, scene=replace(scene, timing=replace(scene.timing, substep_count=count)))
 
 
 def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:

@@ -1,5 +1,7 @@
 """Scripted episodes: steps such as MoveTo and PressUntil, run in an environment, give a Trace in newtons."""
 
+from surgsim_env.scripting.motion_file import TIP_PREFIX, motion_columns, read_motion
+from surgsim_env.scripting.observations import selected_observations, stacked_observations
 from surgsim_env.scripting.oracle import oracle_script
 from surgsim_env.scripting.run import ScriptError, run_script
 from surgsim_env.scripting.steps import (
@@ -19,6 +21,7 @@ from surgsim_env.scripting.steps import (
     Script,
     Step,
     StepFailed,
+    Tracked,
     Until,
     View,
     WaitUntil,
@@ -26,6 +29,7 @@ from surgsim_env.scripting.steps import (
 from surgsim_env.scripting.trace import StepInterval, Trace
 
 __all__ = [
+    "TIP_PREFIX",
     "AwaitEnd",
     "CloseJaw",
     "Control",
@@ -45,9 +49,14 @@ __all__ = [
     "StepFailed",
     "StepInterval",
     "Trace",
+    "Tracked",
     "Until",
     "View",
     "WaitUntil",
+    "motion_columns",
     "oracle_script",
+    "read_motion",
     "run_script",
+    "selected_observations",
+    "stacked_observations",
 ]

@@ -14,8 +14,8 @@ from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
-from surgsim_env.haptics.trajectory import TIP, read_motion
 from surgsim_env.instruments.instrument import Grasp
+from surgsim_env.scripting.motion_file import TIP_PREFIX, read_motion
 from surgsim_env.tasks.layout import TaskLayout
 
 Action = NDArray[np.floating]
@@ -260,7 +260,7 @@ class Follow(_Checked):
 def _recorded_path(path: Path, mark: str) -> tuple[FloatArray, FloatArray]:
     """Times from 0 [s] (n,) and places [m] (n, 3) of a tip that was recorded, else of a hand without pauses."""
     with path.open(encoding="utf-8", errors="replace") as file:
-        of_tip = f"{TIP}x{mark}" in file.readline().strip().split(",")
+        of_tip = f"{TIP_PREFIX}x{mark}" in file.readline().strip().split(",")
     motion = read_motion(path, mark, of_tip=of_tip)
     known = np.isfinite(motion.position).all(axis=1)
     time, places = motion.time[known], motion.position[known]

@@ -12,9 +12,9 @@ from surgsim_env.coupling.sensors import ForceReading
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, Site, charted_face, healthy_map_of
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimate, LesionEstimator
-from surgsim_env.palpation.member_map import member_map, still_template
-from surgsim_env.palpation.press import PressResult
+from surgsim_env.palpation.member_chart import member_map, still_template
 from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
+from surgsim_env.palpation.site_press import PressResult
 from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SiteTouches, Touch, felt_lesion_radius
 from surgsim_env.scene.levels import REFERENCE_TIP
 from surgsim_env.tasks.channels import soft_force_share

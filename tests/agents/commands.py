@@ -3,7 +3,7 @@
 import contextlib
 import io
 
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 
 
 def surgsim(*arguments: str) -> None:

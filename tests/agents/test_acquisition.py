@@ -5,24 +5,24 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the `agents` extra")
 
-from surgsim_env.palpation.chart import MAP_SIDE
-from surgsim_env.palpation.lesion_estimator import (
-    BACKGROUND_SPREAD,
-    EXCESS_LENGTH,
-    EXCESS_SPREAD,
-    MODEL_SPREAD,
-)
-from surgsim_env.scoring.evaluate import policies_folder
-from surgsim_env.scoring.site_search import UCB_BETA
-from surgsim_env.training.acquisition import Acquisition
-from surgsim_env.training.policy_files import load_policy
-from surgsim_env.training.site_agent import (
+from surgsim_apps.scoring.evaluate import policies_folder
+from surgsim_apps.scoring.site_search import UCB_BETA
+from surgsim_apps.training.acquisition import Acquisition
+from surgsim_apps.training.policy_files import load_policy
+from surgsim_apps.training.site_agent import (
     LENGTH_SHARE,
     OBSERVATION_SIZE,
     SITE_COUNT,
     SLICES,
     SiteProcess,
     observed_facts,
+)
+from surgsim_env.palpation.chart import MAP_SIDE
+from surgsim_env.palpation.lesion_estimator import (
+    BACKGROUND_SPREAD,
+    EXCESS_LENGTH,
+    EXCESS_SPREAD,
+    MODEL_SPREAD,
 )
 
 pytestmark = pytest.mark.agents

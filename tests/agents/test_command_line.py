@@ -16,8 +16,8 @@ PACKAGES = {
 }
 # Of ours, what imports them; imported anew here.
 NEEDING = (
-    *("agents", "surgsim_env.cli", "surgsim_env.envs", "surgsim_env.live", "surgsim_env.scoring"),
-    "surgsim_env.training",
+    *("agents", "surgsim_apps.cli", "surgsim_env.envs", "surgsim_apps.live", "surgsim_apps.scoring"),
+    "surgsim_apps.training",
 )
 
 
@@ -57,7 +57,7 @@ def without_extras(monkeypatch) -> Iterator[None]:
     ],
 )
 def test_a_command_names_the_missing_extra(without_extras, arguments: list[str], missing: str, capsys):
-    main = importlib.import_module("surgsim_env.cli.main").main
+    main = importlib.import_module("surgsim_apps.cli.main").main
     assert main(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"surgsim: error: surgsim {arguments[0]} needs {missing}: pip install 'surgsim[agents]'"

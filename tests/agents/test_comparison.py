@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgsim_apps.scoring.comparison import compare, describe
+from surgsim_apps.scoring.results import SITES, Result
 from surgsim_env.palpation.scores import ScoreEstimate
-from surgsim_env.scoring.comparison import compare, describe
-from surgsim_env.scoring.results import SITES, Result
 
 pytestmark = pytest.mark.agents
 SEEDS = tuple(range(1_000_000, 1_000_040))

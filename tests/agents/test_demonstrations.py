@@ -58,7 +58,7 @@ def test_an_episode_comes_back_to_the_bit(dataset):
 
 def test_a_policy_is_cloned_in_one_script(dataset, tmp_path, capsys):
     from agents.behaviour_cloning import main
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.training.policy_files import load_policy
 
     main([NAME, "--out", str(tmp_path / "clone.json"), "--updates", "600"])
     assert f"{NAME}: 2 episodes, {dataset.total_steps} steps" in capsys.readouterr().out
@@ -219,8 +219,8 @@ class OfEnvironment:
 
 def test_a_recorded_episode_of_presses_is_the_one_that_is_scored():
     from agents.record_demonstrations import player, record
-    from surgsim_env.scoring.evaluate import evaluate, find_player
-    from surgsim_env.scoring.options import ScoringOptions
+    from surgsim_apps.scoring.evaluate import evaluate, find_player
+    from surgsim_apps.scoring.options import ScoringOptions
 
     options = ScoringOptions(scene="phantom_small", budget=4, seeds="3,4", envs=2)
     result = evaluate(find_player(f"{__name__}:Wanderer", options), options, Console(quiet=True))
@@ -234,9 +234,9 @@ def test_a_recorded_episode_of_presses_is_the_one_that_is_scored():
 
 def test_a_recorded_episode_of_control_steps_is_the_one_that_is_scored_to_the_bit():
     from agents.record_demonstrations import player, record
-    from surgsim_env.scoring.episodes import make_envs, play_tasks
-    from surgsim_env.scoring.evaluate import find_player
-    from surgsim_env.scoring.options import ScoringOptions
+    from surgsim_apps.scoring.episodes import make_envs, play_tasks
+    from surgsim_apps.scoring.evaluate import find_player
+    from surgsim_apps.scoring.options import ScoringOptions
 
     env_id, short = "SurgSim/Palpate-v0", {"scene": "phantom_small", "max_episode_steps": 15}
     options = ScoringOptions(env=env_id, env_arguments=json.dumps(short), seeds="3,4")

@@ -8,9 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.scores import MapScore, press_errors
-from surgsim_env.rendering import gl
-from surgsim_env.scoring.episodes import (
+from surgsim_apps.scoring.episodes import (
     AgentActor,
     EpisodeFacts,
     agent_generator,
@@ -21,7 +19,9 @@ from surgsim_env.scoring.episodes import (
     play_tasks,
     site_success,
 )
-from surgsim_env.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
+from surgsim_apps.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
+from surgsim_env.palpation.scores import MapScore, press_errors
+from surgsim_env.rendering import gl
 from surgsim_env.tasks.palpate import EPISODE_STEPS
 
 pytestmark = pytest.mark.agents

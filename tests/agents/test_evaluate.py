@@ -14,13 +14,10 @@ import numpy as np
 import pytest
 
 from agents import leaderboard
-from surgsim_env.palpation.scores import ScoreEstimate
-from surgsim_env.scene.digest import PHYSICS_VERSION
-from surgsim_env.scene.load import scenes_folder
-from surgsim_env.scoring import evaluate
-from surgsim_env.scoring.evaluate import policies_folder
-from surgsim_env.scoring.options import ScoringOptions
-from surgsim_env.scoring.results import (
+from surgsim_apps.scoring import evaluate
+from surgsim_apps.scoring.evaluate import policies_folder
+from surgsim_apps.scoring.options import ScoringOptions
+from surgsim_apps.scoring.results import (
     SITES,
     Result,
     load_result,
@@ -29,6 +26,9 @@ from surgsim_env.scoring.results import (
     seeds_text,
     shipped_results,
 )
+from surgsim_env.palpation.scores import ScoreEstimate
+from surgsim_env.scene.digest import PHYSICS_VERSION
+from surgsim_env.scene.load import scenes_folder
 from tests.agents.commands import surgsim
 
 pytestmark = pytest.mark.agents
@@ -169,9 +169,9 @@ def test_wrong_options_are_refused() -> None:
     [
         (["--agent", "gp_ubc"], "agent 'gp_ubc' is unknown"),
         (["--agent", "nowhere_at_all:Agent"], "there is no module 'nowhere_at_all' on Python's path"),
-        (["--agent", "surgsim_env.scoring.site_search:Nobody"], "has no class 'Nobody'"),
-        (["--agent", "surgsim_env.scoring.evaluate:Player"], "missing"),
-        (["--agent", "surgsim_env.scoring.site_search:SiteFacts"], "missing"),
+        (["--agent", "surgsim_apps.scoring.site_search:Nobody"], "has no class 'Nobody'"),
+        (["--agent", "surgsim_apps.scoring.evaluate:Player"], "missing"),
+        (["--agent", "surgsim_apps.scoring.site_search:SiteFacts"], "missing"),
         (["--agent", "expert_retract", "--level", "hard"], "argument 'level' is unknown"),
         (["--agent", "expert_retract", "--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
         (["--agent", "expert_retract", "--budget", "3"], "--budget is the number of presses"),
@@ -202,12 +202,12 @@ def test_results_of_other_seeds_are_not_written_by_themselves(
     for arguments in (
         ["--agent", "random", "--seeds", "3"],
         ["--agent", "random", "--episodes", "1"],
-        ["--agent", "surgsim_env.scoring.site_search:RandomSites", "--episodes", "1"],
+        ["--agent", "surgsim_apps.scoring.site_search:RandomSites", "--episodes", "1"],
     ):
         surgsim("evaluate", *arguments, *common)
         assert "not written (--results FOLDER does)" in capsys.readouterr().out
     assert not (tmp_path / "ours").exists()
-    monkeypatch.setattr("surgsim_env.scoring.options.EVALUATION_SEEDS", range(1_000_000, 1_000_001))
+    monkeypatch.setattr("surgsim_apps.scoring.options.EVALUATION_SEEDS", range(1_000_000, 1_000_001))
     own_scene = shutil.copy(scenes_folder() / "organs" / "phantom_small.toml", tmp_path)
     for arguments in (
         ["--scene", "phantom_small", "--budget", "1"],
@@ -229,9 +229,9 @@ def test_a_family_is_scored_on_its_test_split(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the `agents` extra")
     described = SimpleNamespace(env_id=SITES, env_kwargs={"scene": "liver_family", "split": "train"})
     policy = SimpleNamespace(description=described, reset=lambda count: None)
-    mine = "surgsim_env.scoring.site_search:RandomSites"
+    mine = "surgsim_apps.scoring.site_search:RandomSites"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("surgsim_env.training.policy_files.load_policy", lambda path, **more: policy)
+        patch.setattr("surgsim_apps.training.policy_files.load_policy", lambda path, **more: policy)
 
         def split(method: str, **given: Any) -> str | None:
             made = ScoringOptions(**given)

@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("torch", reason="needs the `agents` extra")
 import torch
 
-from surgsim_env.training.fit import fit
-from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork
+from surgsim_apps.training.fit import fit
+from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
 
 pytestmark = pytest.mark.agents
 GAIN = np.array([[0.5, -0.3], [0.2, 0.4], [-0.3, 0.1]])

@@ -12,9 +12,9 @@ pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
 
 def environments(stage: dict | None, count: int = 3):
     """Environments with the rewards of a stage, or bare ones."""
+    from surgsim_apps.training.curriculum import Stage, StagedRewards
+    from surgsim_apps.training.palpate_surrogate import PalpateSurrogate
     from surgsim_env.envs.stable_baselines import VectorEnvForStableBaselines
-    from surgsim_env.training.curriculum import Stage, StagedRewards
-    from surgsim_env.training.palpate_surrogate import PalpateSurrogate
 
     bare = VectorEnvForStableBaselines(PalpateSurrogate(count))
     return bare if stage is None else StagedRewards(bare, Stage(**stage))
@@ -117,7 +117,7 @@ class Counting:
 
 
 def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
-    from surgsim_env.training.curriculum import RepeatedAction
+    from surgsim_apps.training.curriculum import RepeatedAction
 
     envs = RepeatedAction(Counting(), 4)
     envs.reset()
@@ -132,7 +132,7 @@ def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
 def test_the_touch_summary_is_what_it_says():
     import torch
 
-    from surgsim_env.training.touch_features import TouchSummary
+    from surgsim_apps.training.touch_features import TouchSummary
 
     envs = environments(None, count=8)
     envs.seed(5)
@@ -171,8 +171,8 @@ def test_the_touch_summary_is_what_it_says():
 def test_a_run_leaves_a_policy_that_plays_and_is_resumed(tmp_path: Path, monkeypatch):
     from agents import learn_from_scratch
     from agents.learn_from_scratch import RECIPES, train
-    from surgsim_env.training.curriculum import Stage
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.training.curriculum import Stage
+    from surgsim_apps.training.policy_files import load_policy
 
     recipe = RECIPES["palpate"]
     stages = (recipe.stages[0], Stage(256, novelty=0.1))

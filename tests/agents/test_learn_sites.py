@@ -25,11 +25,11 @@ from agents.learn_sites import (
     presses_to_stay,
     weighted_sources,
 )
-from surgsim_env.training.acquisition import Acquisition
-from surgsim_env.training.policy_files import load_policy
-from surgsim_env.training.recorded_faces import load_faces
-from surgsim_env.training.site_agent import GrowingBelief, SiteProcess, observed_facts
-from surgsim_env.training.site_surrogate import SiteSurrogate
+from surgsim_apps.training.acquisition import Acquisition
+from surgsim_apps.training.policy_files import load_policy
+from surgsim_apps.training.recorded_faces import load_faces
+from surgsim_apps.training.site_agent import GrowingBelief, SiteProcess, observed_facts
+from surgsim_apps.training.site_surrogate import SiteSurrogate
 
 pytestmark = pytest.mark.agents
 FILE = Path(learn_sites.__file__).parent / "faces" / "phantom_standard_held.npz"

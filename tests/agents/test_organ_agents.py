@@ -28,7 +28,7 @@ def first():
 
 def changed(observation, **channels):
     """Observations (n, n_observation) with some channels replaced; arrays are flattened."""
-    from surgsim_env.training.face_features import FACE
+    from surgsim_apps.training.face_features import FACE
 
     made = np.array(observation, dtype=np.float32)[None]
     for name, values in channels.items():
@@ -39,14 +39,14 @@ def changed(observation, **channels):
 def features(observations):
     import torch
 
-    from surgsim_env.training.face_features import face_features
+    from surgsim_apps.training.face_features import face_features
 
     found = face_features(torch.as_tensor(observations))
     return {one.name: getattr(found, one.name).numpy()[0] for one in fields(found)}
 
 
 def actions(observations):
-    from surgsim_env.scoring.expert_organs import OrganExpert
+    from surgsim_apps.scoring.expert_organs import OrganExpert
 
     return OrganExpert().act(observations)[0]
 
@@ -55,7 +55,7 @@ def actions(observations):
 
 
 def test_the_channels_are_the_environments(first):
-    from surgsim_env.training.face_features import FACE, OBSERVATION_SIZE
+    from surgsim_apps.training.face_features import FACE, OBSERVATION_SIZE
 
     env, observation = first
     assert env.unwrapped.observation_slices == FACE and observation.shape == (OBSERVATION_SIZE,)
@@ -124,8 +124,8 @@ def test_sizes_are_relative_to_the_tip(first):
 def test_the_expert_follows_slopes_and_lifts_before_the_soft_limit(first):
     import torch
 
-    from surgsim_env.scoring.expert_organs import DEPTH, expert_actions
-    from surgsim_env.training.face_features import face_features
+    from surgsim_apps.scoring.expert_organs import DEPTH, expert_actions
+    from surgsim_apps.training.face_features import face_features
 
     _, observation = first
     there = face_features(torch.as_tensor(changed(observation)))
@@ -155,7 +155,7 @@ def test_the_expert_finds_the_lesion_gently_on_the_organ():
 
 def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch):
     from agents import learn_palpate_organs
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.training.policy_files import load_policy
 
     path = tmp_path / "taught.json"
     arguments = ["--out", path, "--scenes", "phantom_small", "--rounds", 2, "--imagined", 600, "--epochs", 1]
@@ -172,7 +172,7 @@ def test_teaching_writes_a_policy_that_plays(tmp_path: Path, monkeypatch):
 
 
 def surrogate(scene, seed=3):
-    from surgsim_env.training.face_surrogate import FaceSurrogate
+    from surgsim_apps.training.face_surrogate import FaceSurrogate
 
     env = gym.make(ID, scene=scene, level="standard", scaled=True, **SETTINGS)
     return FaceSurrogate([env], np.random.default_rng(seed))
@@ -180,7 +180,7 @@ def surrogate(scene, seed=3):
 
 def test_the_surrogate_presses_as_the_organ_does():
     """On the liver, away from the lesion: the same depth, and a force of the same size along the same normal."""
-    from surgsim_env.training.face_features import FACE
+    from surgsim_apps.training.face_features import FACE
 
     made = surrogate("liver")
     made.reset()
@@ -202,7 +202,7 @@ def test_the_surrogate_presses_as_the_organ_does():
 
 
 def test_the_expert_finds_the_lesion_on_the_surrogate_of_a_family():
-    from surgsim_env.scoring.expert_organs import OrganExpert
+    from surgsim_apps.scoring.expert_organs import OrganExpert
 
     made, expert = surrogate("kidney_family"), OrganExpert()
     observations = made.reset()
@@ -217,7 +217,7 @@ def test_the_expert_finds_the_lesion_on_the_surrogate_of_a_family():
 
 @pytest.mark.parametrize("scene", ["phantom", "phantom_wide", "liver", "kidney_family"])
 def test_the_committed_policy_takes_any_organ(scene):
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.training.policy_files import load_policy
 
     load_policy(POLICY).check_environment(gym.make(ID, scene=scene, **SETTINGS))
 
@@ -227,9 +227,9 @@ def test_the_committed_policy_does_as_it_was_taught(first):
     import torch
 
     from agents.learn_palpate_organs import imagined
-    from surgsim_env.scoring.expert_organs import expert_actions
-    from surgsim_env.training.face_features import face_summary
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.scoring.expert_organs import expert_actions
+    from surgsim_apps.training.face_features import face_summary
+    from surgsim_apps.training.policy_files import load_policy
 
     network = load_policy(POLICY).decider
     made = imagined(4000, np.random.default_rng(5))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from surgsim_env.scoring.results import load_result
+from surgsim_apps.scoring.results import load_result
 from tests.agents.commands import surgsim
 from tests.docs.test_tutorials import blocks
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.scoring.evaluate import policies_folder
+from surgsim_apps.scoring.evaluate import policies_folder
 
 pytestmark = pytest.mark.agents
 pytest.importorskip("torch", reason="needs the `agents` extra")
@@ -15,7 +15,7 @@ SMALL = {"scene": "phantom_small", "memory": True}
 
 
 def surrogate(count: int):
-    from surgsim_env.training.palpate_surrogate import PalpateSurrogate
+    from surgsim_apps.training.palpate_surrogate import PalpateSurrogate
 
     return PalpateSurrogate(count)
 
@@ -45,7 +45,7 @@ def test_the_formula_presses_as_the_organ_does():
 
 def test_its_memory_is_the_environments():
     """The observation's memory, recomputed from its first ten entries by `TouchMemory` itself."""
-    from surgsim_env.scoring.expert_palpate import PalpateExpert
+    from surgsim_apps.scoring.expert_palpate import PalpateExpert
 
     envs = surrogate(2)
     env = envs.envs[0]
@@ -68,7 +68,7 @@ def test_its_memory_is_the_environments():
 
 
 def test_its_spaces_rewards_and_ends_are_the_environments():
-    from surgsim_env.scoring.expert_palpate import PalpateExpert
+    from surgsim_apps.scoring.expert_palpate import PalpateExpert
 
     envs = surrogate(16)
     assert envs.single_observation_space == gym.make(ID, **SMALL).observation_space
@@ -105,7 +105,7 @@ def test_pressing_on_is_a_safety_stop_that_pays_least():
 
 
 def test_the_expert_finds_the_lesion_gently_on_the_organ():
-    from surgsim_env.scoring.expert_palpate import PalpateExpert
+    from surgsim_apps.scoring.expert_palpate import PalpateExpert
 
     env = gym.make(ID, scene="phantom_small", level="standard", memory=True)
     expert = PalpateExpert(env)
@@ -120,7 +120,7 @@ def test_the_expert_finds_the_lesion_gently_on_the_organ():
 
 
 def test_the_expert_refuses_what_it_cannot_do():
-    from surgsim_env.scoring.expert_palpate import PalpateExpert
+    from surgsim_apps.scoring.expert_palpate import PalpateExpert
 
     with pytest.raises(ValueError, match="make the environment with memory=True"):
         PalpateExpert(gym.make(ID))
@@ -133,7 +133,7 @@ def test_the_expert_refuses_what_it_cannot_do():
 
 def test_the_shipped_policy_searches_as_it_was_taught():
     """By formula, which is quick: four of five find their lesion."""
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.training.policy_files import load_policy
 
     policy, envs = load_policy(policies_folder() / "palpate_phantom_small_scratch.json"), surrogate(32)
     observation, _ = envs.reset(seed=11)

@@ -14,12 +14,12 @@ import torch
 
 import surgsim_env  # noqa: F401
 from agents.learn_retract import IMAGINED_PULL, UNHELD_PULLS, Player
+from surgsim_apps.scoring import expert_retract
+from surgsim_apps.scoring.evaluate import policies_folder
+from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, PULL_MOST, PUSH_MOST, SLICES, TIP, TolerantExpert
+from surgsim_apps.training.picture_features import PictureAndForce
+from surgsim_apps.training.policy_files import load_policy
 from surgsim_env.rendering import gl
-from surgsim_env.scoring import expert_retract
-from surgsim_env.scoring.evaluate import policies_folder
-from surgsim_env.scoring.expert_retract import GRIP, HOLDS, PULL, PULL_MOST, PUSH_MOST, SLICES, TIP, TolerantExpert
-from surgsim_env.training.picture_features import PictureAndForce
-from surgsim_env.training.policy_files import load_policy
 
 pytestmark = pytest.mark.agents
 
@@ -154,7 +154,7 @@ def test_all_pulls_that_hold_nothing_are_imagined_several_times():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, monkeypatch, capsys):
     """Two rounds of a few steps; each state is kept under two looks."""
     from agents import learn_retract
-    from surgsim_env.scoring.episodes import make_envs, play_tasks
+    from surgsim_apps.scoring.episodes import make_envs, play_tasks
 
     out = tmp_path / "policy.json"
     arguments = ["--pictures", "--rounds", "2", "--envs", "2", "--steps", "3", "--updates", "2", "--out", str(out)]

@@ -11,10 +11,10 @@ pytest.importorskip("safetensors", reason="needs the `agents` extra")
 import torch
 
 import surgsim_env  # noqa: F401
-from surgsim_env.scoring.episodes import agent_generator
-from surgsim_env.scoring.evaluate import policies_folder
-from surgsim_env.training.policy_files import PolicyDescription, TrainedPolicy, load_policy, save_policy
-from surgsim_env.training.policy_network import NetworkLayout, PolicyNetwork, actor_of
+from surgsim_apps.scoring.episodes import agent_generator
+from surgsim_apps.scoring.evaluate import policies_folder
+from surgsim_apps.training.policy_files import PolicyDescription, TrainedPolicy, load_policy, save_policy
+from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork, actor_of
 
 pytestmark = pytest.mark.agents
 ENV_ID = "SurgSim/Palpate-v0"

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from agents import record_faces as script
-from surgsim_env.palpation.chart import MAP_SIDE, interpolated
-from surgsim_env.tasks.declaration import reward_weights
-from surgsim_env.tasks.palpate_sites import PalpateSitesTask
-from surgsim_env.tasks.runtime import TaskRuntime
-from surgsim_env.training import recorded_faces
-from surgsim_env.training.recorded_faces import (
+from surgsim_apps.training import recorded_faces
+from surgsim_apps.training.recorded_faces import (
     FIRST_SEED,
     LANES,
     load_faces,
     record_faces,
 )
-from surgsim_env.training.site_agent import observed_facts
-from surgsim_env.training.site_surrogate import SiteSurrogate
+from surgsim_apps.training.site_agent import observed_facts
+from surgsim_apps.training.site_surrogate import SiteSurrogate
+from surgsim_env.palpation.chart import MAP_SIDE, interpolated
+from surgsim_env.tasks.declaration import reward_weights
+from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.tasks.runtime import TaskRuntime
 
 pytestmark = pytest.mark.agents
 FACES = Path(script.__file__).parent / "faces"

@@ -24,8 +24,8 @@ def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv
 
 def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
     """Three seeds on two environments: each record is that of a single environment, to the bit; all succeed."""
-    from surgsim_env.scoring.episodes import play_tasks, task_figures
-    from surgsim_env.scoring.expert_retract import RetractExpert
+    from surgsim_apps.scoring.episodes import play_tasks, task_figures
+    from surgsim_apps.scoring.expert_retract import RetractExpert
 
     seeds = [21, 22, 23]
     records = play_tasks(RetractExpert().act_all, envs(2), seeds)
@@ -47,7 +47,7 @@ def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
 
 def test_the_expert_follows_from_the_observation_alone():
     """Asked in another order, or again, it says the same; and it keeps still where enough is seen."""
-    from surgsim_env.scoring.expert_retract import GRIP, HOLDS, TIP, VISIBLE, RetractExpert
+    from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, TIP, VISIBLE, RetractExpert
 
     random = np.random.default_rng(0)
     box = gym.make(ID).observation_space
@@ -73,8 +73,8 @@ def test_forces_are_those_entries_of_the_observation():
 def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, monkeypatch, capsys):
     """Two rounds of a few steps."""
     from agents import learn_retract
-    from surgsim_env.scoring.episodes import play_tasks
-    from surgsim_env.training.policy_files import load_policy
+    from surgsim_apps.scoring.episodes import play_tasks
+    from surgsim_apps.training.policy_files import load_policy
 
     out = tmp_path / "policy.json"
     arguments = ["--rounds", "2", "--envs", "2", "--steps", "4", "--updates", "3", "--out", str(out)]

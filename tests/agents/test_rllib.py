@@ -21,7 +21,7 @@ def test_two_workers_learn_and_the_agent_plays(tmp_path: Path):
     done = subprocess.run([sys.executable, *learn], **settings)
     assert done.returncode == 0 and "iteration 0: return" in done.stdout, done.stdout + done.stderr
     place = ["--env", "SurgSim/Palpate-v0", "--level", "standard", "--seeds", "3", "--results", "scores"]
-    score = ["-m", "surgsim_env.cli.main", "evaluate", "--agent", "agents.train_rllib:Trained", *place]
+    score = ["-m", "surgsim_apps.cli.main", "evaluate", "--agent", "agents.train_rllib:Trained", *place]
     arguments = ["--env-arguments", '{"memory": true, "max_episode_steps": 5}']
     done = subprocess.run([sys.executable, *score, *arguments], **settings)
     assert done.returncode == 0 and len(list((tmp_path / "scores").glob("*.json"))) == 1, done.stdout + done.stderr

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from surgsim_apps.scoring.site_search import AGENTS, BOUNDS
+from surgsim_apps.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
-from surgsim_env.scoring.site_search import AGENTS, BOUNDS
-from surgsim_env.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
 
 pytestmark = pytest.mark.agents
 # Under a tip of 8 mm: 11 x 11 sites of the map, 4 mm apart.

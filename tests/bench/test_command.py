@@ -4,10 +4,10 @@ import re
 
 import pytest
 
-from surgsim_env.bench import measurement as effort
-from surgsim_env.bench import peers, side_by_side, start
-from surgsim_env.bench.measurement import Effort
-from surgsim_env.cli.main import main
+from surgsim_apps.bench import measurement as effort
+from surgsim_apps.bench import peers, side_by_side, start
+from surgsim_apps.bench.measurement import Effort
+from surgsim_apps.cli.main import main
 
 TINY = Effort(
     blocks=((4, 4, 4), (7, 7, 5), (8, 8, 5)), substep_rounds=1, scenes=("bovine_liver_block",), haptic_steps=20,

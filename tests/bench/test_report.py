@@ -1,6 +1,6 @@
 """Figures as tables, and what is absent with its reason."""
 
-from surgsim_env.bench.report import Figure, Section, absent, describe, version
+from surgsim_apps.bench.report import Figure, Section, absent, describe, version
 
 SECTION = Section(
     "press",

@@ -1,8 +1,8 @@
 """Rates of training: what is listed of them, and what is absent with its reason; nothing looks at how long it takes."""
 
-from surgsim_env.bench import training
-from surgsim_env.bench.measurement import QUICK
-from surgsim_env.bench.report import AbsentError
+from surgsim_apps.bench import training
+from surgsim_apps.bench.measurement import QUICK
+from surgsim_apps.bench.report import AbsentError
 
 
 def test_rates_are_medians_and_what_cannot_run_says_why(monkeypatch):

@@ -9,10 +9,10 @@ from msdm_core.material.regions import Damping
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.measure import contact_energy
 from msdm_core.organ.stepping import advance_organ
+from surgsim_apps.validation.dynamics import BLOCK, ELASTIC, FREE, Coupled, bounces, free_ball, small_block
 from surgsim_env.instruments.make import Probe
 from surgsim_env.instruments.tool_bodies import ToolBodies
 from surgsim_env.scene.load import make_scene
-from surgsim_env.validation.dynamics import BLOCK, ELASTIC, FREE, Coupled, bounces, free_ball, small_block
 from tests.core import oracle
 
 DT = 1e-3

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 
 import surgsim_env  # noqa: F401
-from surgsim_env.coupling.tip_wrench import tip_wrench
+from surgsim_env.coupling.tip_forces import tip_wrench
 from surgsim_env.scripting import oracle_script, run_script
 
 

@@ -10,11 +10,11 @@ from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.structure_kernels import OrganState
 from msdm_core.organ.compile import rest_state
 from msdm_core.organ.stepping import advance_organ
+from surgsim_apps.validation.dynamics import ELASTIC, UPRIGHT, free_ball
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.tool_bodies import ToolBodies, check_tool_masses, tool_masses
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
-from surgsim_env.validation.dynamics import ELASTIC, UPRIGHT, free_ball
 from tests.core import oracle
 from tests.coupling.test_passivity import resting, static_force
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import pytest
 
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 from surgsim_env.rendering import gl
 
 TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"

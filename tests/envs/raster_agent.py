@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import gymnasium as gym
 import numpy as np
 
-from surgsim_env.scoring.episodes import EpisodeFacts
+from surgsim_apps.scoring.episodes import EpisodeFacts
 
 PRESS_DEPTH = 0.0035  # [m] below the resting surface
 TRAVEL_GAP = 0.0006  # [m] between tip and surface while moving sideways

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from surgsim_env.scoring.episodes import AgentActor, TaskRecord, make_envs, play_tasks
+from surgsim_apps.scoring.episodes import AgentActor, TaskRecord, make_envs, play_tasks
 
 
 class Now:

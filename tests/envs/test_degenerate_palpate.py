@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from surgsim_env.scoring.episodes import agent_generator, episode_facts
+from surgsim_apps.scoring.episodes import agent_generator, episode_facts
 from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, reward_weights
 from surgsim_env.tasks.palpate import DECLARE_STEPS, EPISODE_STEPS, PalpateTask
 from tests.envs.raster_agent import RasterAgent

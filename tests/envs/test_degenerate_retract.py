@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from surgsim_env.scoring.expert_retract import RetractExpert
+from surgsim_apps.scoring.expert_retract import RetractExpert
 from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, reward_weights
 from surgsim_env.tasks.retract import EPISODE_STEPS, SUCCESS_SHARE, RetractTask
 from tests.envs.strategies import Now, mean_return, play
@@ -20,7 +20,7 @@ def move(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: float = 0.0, jaw:
 
 
 def script(now: Now) -> Iterator[np.ndarray]:
-    """The honest agent: `surgsim_env/scoring/expert_retract.py`, whose action is a function of the observation."""
+    """The honest agent: `surgsim_apps/scoring/expert_retract.py`, whose action is a function of the observation."""
     while True:
         yield expert(now)
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from surgsim_env.scoring.site_search import RasterSites
-from surgsim_env.training.site_agent import site_facts
+from surgsim_apps.scoring.site_search import RasterSites
+from surgsim_apps.training.site_agent import site_facts
 from tests.envs.strategies import Now, mean_return, play
 
 ID = "SurgSim/PalpateSites-v0"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401  (registers the ids)
-from surgsim_env.palpation import chart, member_map
+from surgsim_env.palpation import chart, member_chart
 from surgsim_env.palpation.chart import charted_face
 from surgsim_env.scene.anatomy import MemberName, load_anatomy
 from surgsim_env.scene.load import load_scene, scenes_folder
@@ -132,26 +132,26 @@ def test_side_by_side_equals_one_after_the_other(blocks, env_id, settings):
 def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(blocks, tmp_path, monkeypatch):
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     pressed = []
-    member_map.member_map.cache_clear()
+    member_chart.member_map.cache_clear()
 
     def press_sites(anatomy, sites, progress, dtype=None, name=""):
         """Twice as stiff as the template, everywhere."""
         pressed.append((str(anatomy.member), len(sites), name))
         return np.full(len(sites), 100.0)
 
-    monkeypatch.setattr(member_map, "press_sites", press_sites)
-    monkeypatch.setattr(member_map, "healthy_map_of", lambda anatomy: chart.HealthyMap(np.full((13, 13), 50.0)))
+    monkeypatch.setattr(member_chart, "press_sites", press_sites)
+    monkeypatch.setattr(member_chart, "healthy_map_of", lambda anatomy: chart.HealthyMap(np.full((13, 13), 50.0)))
     template = load_anatomy(load_scene(Path(blocks)))
     for number in (0, 1, 0):
-        found = member_map.member_map(template, MemberName("test", number))
+        found = member_chart.member_map(template, MemberName("test", number))
         np.testing.assert_allclose(found.grid, 100.0, rtol=1e-12)
-    count = member_map.PRESS_COUNT
+    count = member_chart.PRESS_COUNT
     assert pressed == [("test 0", count, "test 0"), ("test 1", count, "test 1")]
     assert len(list((tmp_path / "cache").iterdir())) == 2
-    member_map.member_map.cache_clear()
-    member_map.member_map(template, MemberName("test", 0))
+    member_chart.member_map.cache_clear()
+    member_chart.member_map(template, MemberName("test", 0))
     assert len(pressed) == 2, "it is read from the cache"
-    member_map.member_map.cache_clear()
+    member_chart.member_map.cache_clear()
 
 
 def test_healthy_members_have_contrast_one(blocks):
@@ -159,12 +159,12 @@ def test_healthy_members_have_contrast_one(blocks):
     scene = load_scene(Path(blocks))
     template = load_anatomy(replace(scene, family=replace(scene.family, thickness=(0.6, 0.62))))
     name = MemberName("train", 1)
-    member = member_map.make_member(template, name)
+    member = member_chart.make_member(template, name)
     charted = charted_face(member)
     sites = charted.grid_sites()[::9]
     with chart.StepProgress(None) as progress:
         stiffness = chart.press_sites(member, sites, progress)
-    expected = member_map.member_map(template, name).stiffness(np.array([site.place for site in sites]))
+    expected = member_chart.member_map(template, name).stiffness(np.array([site.place for site in sites]))
     error = np.log(stiffness / expected)
     print(f"\nlog contrast of healthy presses: deviation {error.std():.4f}, largest {np.abs(error).max():.4f}")
     assert np.abs(error).max() < 0.03 and error.std() < 0.01

@@ -7,7 +7,7 @@ import pytest
 
 from msdm_core import Relaxation, Stiffening
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import SitePress, press_alone, press_phases
+from surgsim_env.palpation.site_press import SitePress, press_alone, press_phases
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 

@@ -11,7 +11,7 @@ from surgsim_env.coupling.motion import CYCLE_COUNT, draw_drive
 from surgsim_env.coupling.motion_kernels import signal_at
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.coupling.tracking import FRAME_DELAY, SurfaceTracker
-from surgsim_env.palpation.press import SitePress, press_alone, press_phases
+from surgsim_env.palpation.site_press import SitePress, press_alone, press_phases
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion

@@ -10,7 +10,7 @@ import surgsim_env  # noqa: F401
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation import chart as healthy_module
 from surgsim_env.palpation.chart import charted_face, healthy_map, interpolated
-from surgsim_env.palpation.press import SitePress, press, press_alone, press_phases, stop_force
+from surgsim_env.palpation.site_press import SitePress, press, press_alone, press_phases, stop_force
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan
 from surgsim_env.scene.load import make_scene

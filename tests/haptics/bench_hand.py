@@ -8,10 +8,10 @@ import numpy as np
 
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_apps.haptics.coupling import VirtualCoupling
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.settings import HapticSettings
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.coupling import VirtualCoupling
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
 from tests.haptics.simulated import Hand, SimulatedDevice

@@ -2,7 +2,7 @@
 
 import pytest
 
-from surgsim_env.haptics.udp import UdpDevice
+from surgsim_apps.haptics.udp import UdpDevice
 from tests.haptics.udp_link import Clock, Sender
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.haptics.device import DeviceDynamics, DevicePose, require_positive
+from surgsim_apps.haptics.device import DeviceDynamics, DevicePose, require_positive
 
 HandPath = Callable[[float], FloatArray]
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.tip_drive import STEER_TIME
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.tip_drive import STEER_TIME
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, with_instrument
 from tests.haptics.simulated import Hand, SimulatedDevice

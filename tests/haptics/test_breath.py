@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.settings import BREATH_BIT, HapticSettings
+from surgsim_apps.haptics.trajectory import TrajectoryDevice
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import BREATH_BIT, HapticSettings
-from surgsim_env.haptics.trajectory import TrajectoryDevice
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion

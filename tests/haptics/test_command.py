@@ -8,8 +8,8 @@ import threading
 import numpy as np
 import pytest
 
-from surgsim_env.cli.main import main
-from surgsim_env.haptics.pacing import SPIN, Pacer
+from surgsim_apps.cli.main import main
+from surgsim_apps.haptics.pacing import SPIN, Pacer
 from tests.haptics.bench_hand import save_trajectory
 from tests.haptics.test_docs import BRIDGE
 from tests.haptics.udp_link import SharedTime
@@ -57,7 +57,7 @@ def test_bridge_feels_the_organ(monkeypatch, capsys):
             clients.append(threading.Thread(target=client))
             clients[0].start()
 
-    monkeypatch.setattr("surgsim_env.cli.haptics.Pacer", Paced)
+    monkeypatch.setattr("surgsim_apps.cli.haptics.Pacer", Paced)
     assert main(["haptics", "--scene", "phantom_small", "--port", str(port), "--seconds", "2.0"]) == 0
     shared.leave()
     clients[0].join()
@@ -98,7 +98,7 @@ def test_ctrl_c_keeps_the_steps_until_then_whole(tmp_path, monkeypatch, capsys):
 
         steps = 1
 
-    monkeypatch.setattr("surgsim_env.cli.haptics.Pacer", Interrupted)
+    monkeypatch.setattr("surgsim_apps.cli.haptics.Pacer", Interrupted)
     out = tmp_path / "out"
     assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == 0
     assert [path.name for path in out.iterdir()] == ["telemetry.csv"]

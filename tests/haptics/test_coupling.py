@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgsim_env.haptics.coupling import TipDynamics, VirtualCoupling, check_coupling, coupling_for, stiffness_limit
-from surgsim_env.haptics.device import DeviceDynamics
+from surgsim_apps.haptics.coupling import TipDynamics, VirtualCoupling, check_coupling, coupling_for, stiffness_limit
+from surgsim_apps.haptics.device import DeviceDynamics
 
 DT = 1e-3
 TIP = TipDynamics(mass=0.14, damping=2.0)

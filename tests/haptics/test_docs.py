@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.udp import UdpDevice
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.settings import HapticSettings
+from surgsim_apps.haptics.udp import UdpDevice
 from tests.haptics.bench_hand import DT, touching_simulation
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "haptics.md").read_text(encoding="utf-8")

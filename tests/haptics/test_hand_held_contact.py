@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.haptics.coupling import coupling_for, stiffness_limit
-from surgsim_env.haptics.device import DeviceDynamics
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.tip_drive import tip_drives
+from surgsim_apps.haptics.coupling import coupling_for, stiffness_limit
+from surgsim_apps.haptics.device import DeviceDynamics
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.settings import HapticSettings
+from surgsim_apps.haptics.tip_drive import tip_drives
 from tests.haptics.bench_hand import (
     DT,
     START,

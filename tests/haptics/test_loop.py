@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from surgsim_apps.haptics.device import DeviceDynamics, DevicePose
+from surgsim_apps.haptics.loop import HapticLoop, SlewLimit, Watchdog
+from surgsim_apps.haptics.settings import HapticSettings
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.device import DeviceDynamics, DevicePose
-from surgsim_env.haptics.loop import HapticLoop, SlewLimit, Watchdog
-from surgsim_env.haptics.settings import HapticSettings
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from tests.haptics.bench_hand import DT, START, bare_settings, held_device, run, touching_simulation

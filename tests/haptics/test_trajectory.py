@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.trajectory import TrajectoryDevice
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.settings import HapticSettings
+from surgsim_apps.haptics.trajectory import TrajectoryDevice
 from tests.haptics.bench_hand import START, save_trajectory, touching_simulation
 
 

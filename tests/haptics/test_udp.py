@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from surgsim_env.haptics.loop import HapticLoop, TipTelemetry
-from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.haptics.udp import PACKET, PACKETS_PER_READ
+from surgsim_apps.haptics.loop import HapticLoop, TipTelemetry
+from surgsim_apps.haptics.settings import HapticSettings
+from surgsim_apps.haptics.udp import PACKET, PACKETS_PER_READ
 from tests.haptics.bench_hand import touching_simulation
 from tests.haptics.udp_link import Sender, arrived, drained, force_of
 

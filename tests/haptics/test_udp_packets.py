@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgsim_env.haptics.udp import KIND_FORCE, KIND_POSE, MAGIC, POSITION_LARGEST, UdpDevice, newer, unpack_pose
+from surgsim_apps.haptics.udp import KIND_FORCE, KIND_POSE, MAGIC, POSITION_LARGEST, UdpDevice, newer, unpack_pose
 from tests.haptics.udp_link import Sender, arrived, drained, packed
 
 coordinate = st.floats(-POSITION_LARGEST, POSITION_LARGEST)

@@ -4,7 +4,7 @@ import socket
 import threading
 import time
 
-from surgsim_env.haptics.udp import KIND_FORCE, KIND_POSE, MAGIC, PACKET, VERSION, UdpDevice
+from surgsim_apps.haptics.udp import KIND_FORCE, KIND_POSE, MAGIC, PACKET, VERSION, UdpDevice
 
 # How long anything may take before a test gives up [s]. Nothing that passes depends on it.
 SECONDS = 600.0

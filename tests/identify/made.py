@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from surgsim_env.identify.press_model import PressCurve
-from surgsim_env.identify.recordings import Recording, SitePress
-from surgsim_env.identify.relaxation import Arms
+from surgsim_apps.identify.press_model import PressCurve
+from surgsim_apps.identify.recordings import Recording, SitePress
+from surgsim_apps.identify.relaxation import Arms
 
 HEADER = "site,x_mm,y_mm,z_mm,step,depth_mm,normal_force_n,tangential_force_n"
 

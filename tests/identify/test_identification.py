@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_env.cli.main import main
-from surgsim_env.identify import identification, shape_search
-from surgsim_env.identify.identification import IdentifyOptions, identify
-from surgsim_env.identify.press_model import PressShape
-from surgsim_env.identify.recordings import Recording, SitePress
-from surgsim_env.identify.relaxation import Arms
-from surgsim_env.identify.results import COLUMNS, RESULT_NAMES
+from surgsim_apps.cli.main import main
+from surgsim_apps.identify import identification, shape_search
+from surgsim_apps.identify.identification import IdentifyOptions, identify
+from surgsim_apps.identify.press_model import PressShape
+from surgsim_apps.identify.recordings import Recording, SitePress
+from surgsim_apps.identify.relaxation import Arms
+from surgsim_apps.identify.results import COLUMNS, RESULT_NAMES
 from surgsim_env.scene.load import scene_from_table, scenes_folder
 from tests.identify.made import closed_area, closed_press, recording, truth, write_csv
 from tests.identify.test_relaxation import TIME

@@ -8,11 +8,11 @@ import pytest
 from msdm_core import ContactLaw, Material, OrganSpec, box_mesh, compile_organ, rest_state, stable_dt
 from msdm_core.material.regions import Damping
 from msdm_core.organ.stepping import advance, round_shapes
-from surgsim_env.identify import press_model
-from surgsim_env.identify.identification import IdentifyOptions, identify
-from surgsim_env.identify.press_model import CONTACT_STIFFNESS, PressSetting, PressShape, press_block
-from surgsim_env.identify.recordings import Recording, SitePress
-from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites
+from surgsim_apps.identify import press_model
+from surgsim_apps.identify.identification import IdentifyOptions, identify
+from surgsim_apps.identify.press_model import CONTACT_STIFFNESS, PressSetting, PressShape, press_block
+from surgsim_apps.identify.recordings import Recording, SitePress
+from surgsim_apps.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites
 from tests.identify.made import recording, truth
 
 SETTING = PressSetting(depth=2.5e-3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgsim_env.identify.recordings import read_recording
+from surgsim_apps.identify.recordings import read_recording
 from tests.identify.made import HEADER, recording, write_csv
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surgsim_env.identify.relaxation import Arms, fit_relaxation, held_sites
-from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve
+from surgsim_apps.identify.relaxation import Arms, fit_relaxation, held_sites
+from surgsim_apps.identify.site_fit import GRID_COUNT, SampledCurve
 from tests.identify.made import recording
 
 # 0.5 s of loading in 40 samples, then 20 s of hold.

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surgsim_env.identify.recordings import SitePress
-from surgsim_env.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites, sort_out
+from surgsim_apps.identify.recordings import SitePress
+from surgsim_apps.identify.site_fit import GRID_COUNT, SampledCurve, SiteSamples, fit_sites, sort_out
 from tests.identify.made import recording, truth
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.arm_instrument import ArmInstrument, check_port_outside, default_port
-from surgsim_env.palpation.press import press
+from surgsim_env.palpation.site_press import press
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.model import Port

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from surgsim_env.live.exchange_records import Change, Phase
-from surgsim_env.live.organ_choice import NONE, OrganChoice
-from surgsim_env.patient.fine_surface import split_edges
+from surgsim_apps.live.exchange_records import Change, Phase
+from surgsim_apps.live.organ_choice import NONE, OrganChoice
+from surgsim_apps.patient.fine_surface import split_edges
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import FineSurface, Scene

@@ -2,7 +2,7 @@
 
 import struct
 
-from surgsim_env.live.messages import HandMotion
+from surgsim_apps.live.messages import HandMotion
 
 
 def write_hand(motion: HandMotion) -> bytes:

@@ -12,7 +12,7 @@ import msgspec.msgpack
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.live.stage import SCALE
+from surgsim_apps.live.stage import SCALE
 from surgsim_env.scene.anatomy import Anatomy
 
 # Period of its presses [s].

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from websockets.asyncio.client import connect
 
-from surgsim_env.haptics.pacing import PaceSettings
-from surgsim_env.live.page import Page
-from surgsim_env.live.session import Session
+from surgsim_apps.haptics.pacing import PaceSettings
+from surgsim_apps.live.page import Page
+from surgsim_apps.live.session import Session
 from surgsim_env.scene.load import make_scene
 
 # A physics at a quarter of real time leaves room on a machine where other tests run beside.

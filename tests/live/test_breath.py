@@ -7,8 +7,8 @@ import pytest
 
 from msdm_core.organ.motion import SIGNAL
 from msdm_core.organ.support import Support
-from surgsim_env.live.exchange_records import TRACE_STEPS, Reset
-from surgsim_env.live.session import BREATH_BUTTON
+from surgsim_apps.live.exchange_records import TRACE_STEPS, Reset
+from surgsim_apps.live.session import BREATH_BUTTON
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion, Scene
 from tests.live.test_physics import Bench

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from surgsim_env.haptics.pacing import PaceSettings
-from surgsim_env.live.exchange_records import Pause, Phase, Reset
-from surgsim_env.live.messages import HandMotion
-from surgsim_env.live.page import Page
-from surgsim_env.live.session import HAND_SPEED, Session
-from surgsim_env.live.stage import page_camera
+from surgsim_apps.haptics.pacing import PaceSettings
+from surgsim_apps.live.exchange_records import Pause, Phase, Reset
+from surgsim_apps.live.messages import HandMotion
+from surgsim_apps.live.page import Page
+from surgsim_apps.live.session import HAND_SPEED, Session
+from surgsim_apps.live.stage import page_camera
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.model import Scene
 from tests.live.served import Clock, wait_until

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgsim_env.cli import main as cli
-from surgsim_env.live.exchange_records import LiveError
+from surgsim_apps.cli import main as cli
+from surgsim_apps.live.exchange_records import LiveError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # A recording begins by itself once the page is served; time begins to pass for `--seconds` when it has some steps.
@@ -19,10 +19,10 @@ import math
 import sys
 import time
 from types import SimpleNamespace
-from surgsim_env.cli import view
-from surgsim_env.cli.main import main
-from surgsim_env.live.page import Page
-from surgsim_env.live.exchange_records import Record
+from surgsim_apps.cli import view
+from surgsim_apps.cli.main import main
+from surgsim_apps.live.page import Page
+from surgsim_apps.live.exchange_records import Record
 
 class Recording(Page):
     begun, begin = False, math.inf
@@ -37,8 +37,8 @@ class Recording(Page):
             print("recording", flush=True)
 
 if __name__ == "__main__":
-    import surgsim_env.live.page
-    surgsim_env.live.page.Page = Recording
+    import surgsim_apps.live.page
+    surgsim_apps.live.page.Page = Recording
     view.time = SimpleNamespace(monotonic=lambda: max(0.0, time.monotonic() - Recording.begin))
     sys.exit(main(["view", "--scene", "phantom_small", "--port", "0", *sys.argv[1:]]))
 """
@@ -72,7 +72,7 @@ def test_a_session_that_fails_is_said_in_one_line(monkeypatch, capsys):
     def fail(*_):
         raise LiveError("the physics' process died: why")
 
-    monkeypatch.setattr("surgsim_env.cli.view.View.run", fail)
+    monkeypatch.setattr("surgsim_apps.cli.view.View.run", fail)
     assert cli.main(["view"]) == 2
     assert capsys.readouterr().err == "surgsim: error: the physics' process died: why\n"
 

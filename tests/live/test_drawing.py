@@ -31,7 +31,7 @@ MOVE = "count % 5 || window.dispatchEvent(new PointerEvent('pointerdown'))"
 def browser(chromium):
     with chromium.page(200, 100) as made:
         made.before_pages(STEPPED)
-        made.before_pages(files("surgsim_env.live").joinpath("drawing.js").read_text(encoding="utf-8"))
+        made.before_pages(files("surgsim_apps.live").joinpath("drawing.js").read_text(encoding="utf-8"))
         made.open("data:text/html,<p>nothing</p>")
         made.wait_for("document.readyState === 'complete' && document.body.innerText.includes('nothing')")
         yield made

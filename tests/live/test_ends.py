@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from surgsim_env.live.exchange_records import LiveError
-from surgsim_env.live.organ_choice import HIDDEN, OrganChoice
-from surgsim_env.live.page import Page
-from surgsim_env.live.session import Session
+from surgsim_apps.live.exchange_records import LiveError
+from surgsim_apps.live.organ_choice import HIDDEN, OrganChoice
+from surgsim_apps.live.page import Page
+from surgsim_apps.live.session import Session
 from surgsim_env.scene.load import make_scene
 from tests.live.served import PACE, wait_until
 
@@ -20,8 +20,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 CHILD = """
 import sys, time
-from surgsim_env.live.session import Session
-from surgsim_env.haptics.pacing import PaceSettings
+from surgsim_apps.live.session import Session
+from surgsim_apps.haptics.pacing import PaceSettings
 from surgsim_env.scene.load import make_scene
 if __name__ == "__main__":
     session = Session(make_scene("phantom_small"), pace=PaceSettings(period=0.01))
@@ -71,7 +71,7 @@ def test_a_physics_that_dies_is_said(tmp_path):
 def test_why_the_physics_refused_is_said(monkeypatch):
     """What only the child finds out."""
     monkeypatch.setattr(
-        "surgsim_env.live.session.OrganChoice", lambda lesions: OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)
+        "surgsim_apps.live.session.OrganChoice", lambda lesions: OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)
     )
     session = Session(make_scene("phantom_small"), pace=PACE)
     try:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgsim_env.live.stage import SCALE, FeltMap, OrganView
+from surgsim_apps.live.stage import SCALE, FeltMap, OrganView
 from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
 from surgsim_env.scene.anatomy import load_anatomy
 

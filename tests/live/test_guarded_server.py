@@ -10,9 +10,9 @@ import viser
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from surgsim_env.live import guarded_server
-from surgsim_env.live.exchange_records import LiveError
-from surgsim_env.live.guarded_server import GuardedServer
+from surgsim_apps.live import guarded_server
+from surgsim_apps.live.exchange_records import LiveError
+from surgsim_apps.live.guarded_server import GuardedServer
 from tests.live.protocol_client import CAMERA
 from tests.live.served import SECONDS
 

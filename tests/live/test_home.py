@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from surgsim_apps.live.physics import SHAPE_GAP, home_of
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.live.physics import SHAPE_GAP, home_of
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, with_instrument
 

@@ -1,6 +1,6 @@
 """Packets of `hand.js`: what arrives of a motion."""
 
-from surgsim_env.live.messages import HandMotion, read_hand
+from surgsim_apps.live.messages import HandMotion, read_hand
 from tests.live.packets import write_hand
 
 

@@ -6,9 +6,9 @@ import os
 import numpy as np
 import pytest
 
-from surgsim_env.live.exchange_records import Record, Reset
-from surgsim_env.live.messages import HandMotion
-from surgsim_env.live.session import HAND_SPEED, HELD
+from surgsim_apps.live.exchange_records import Record, Reset
+from surgsim_apps.live.messages import HandMotion
+from surgsim_apps.live.session import HAND_SPEED, HELD
 from tests.live.packets import write_hand
 from tests.live.protocol_client import ProtocolClient, press_path
 from tests.live.served import SECONDS, wait_until

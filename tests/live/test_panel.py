@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgsim_env.live import panel as module
-from surgsim_env.live.exchange_records import Phase, new_exchange
-from surgsim_env.live.organ_choice import HIDDEN
-from surgsim_env.live.panel import PLOT_LEAST, PLOTTED, Panel
+from surgsim_apps.live import panel as module
+from surgsim_apps.live.exchange_records import Phase, new_exchange
+from surgsim_apps.live.organ_choice import HIDDEN
+from surgsim_apps.live.panel import PLOT_LEAST, PLOTTED, Panel
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.motions import with_motion
 

@@ -5,9 +5,8 @@ import multiprocessing
 import numpy as np
 import pytest
 
-from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.pacing import PaceSettings
-from surgsim_env.live.exchange_records import (
+from surgsim_apps.haptics.pacing import PaceSettings
+from surgsim_apps.live.exchange_records import (
     TRACE_STEPS,
     Change,
     End,
@@ -17,7 +16,7 @@ from surgsim_env.live.exchange_records import (
     Reset,
     new_exchange,
 )
-from surgsim_env.live.organ_choice import (
+from surgsim_apps.live.organ_choice import (
     HIDDEN,
     NONE,
     OrganChoice,
@@ -26,8 +25,9 @@ from surgsim_env.live.organ_choice import (
     lesion_kinds,
     live_scene,
 )
-from surgsim_env.live.physics import Physics
-from surgsim_env.live.stage import COLOURS, FeltMap, colour_levels
+from surgsim_apps.live.physics import Physics
+from surgsim_apps.live.stage import COLOURS, FeltMap, colour_levels
+from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene

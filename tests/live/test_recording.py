@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from surgsim_env.haptics.trajectory import TrajectoryDevice, read_motion
-from surgsim_env.live.exchange_records import recording_type
-from surgsim_env.live.recording import write_recording
+from surgsim_apps.haptics.trajectory import TrajectoryDevice
+from surgsim_apps.live.exchange_records import recording_type
+from surgsim_apps.live.recording import write_recording
+from surgsim_env.scripting.motion_file import read_motion
 
 STEP = 1e-3
 
@@ -39,7 +40,7 @@ def test_a_recording_that_finds_no_space_leaves_nothing_and_is_named(tmp_path, m
         raise OSError(28, "No space left on device")
 
     write_recording(made_steps(), tmp_path)
-    monkeypatch.setattr("surgsim_env.live.recording.np.savetxt", full)
+    monkeypatch.setattr("surgsim_apps.live.recording.np.savetxt", full)
     told = write_recording(made_steps(), tmp_path)
     assert told.startswith("the recording was not written: ") and "No space left on device" in told
     assert [path.name for path in tmp_path.iterdir()] == ["recording-1.csv"]
@@ -55,7 +56,7 @@ def test_two_sessions_with_one_folder_take_no_number_twice(tmp_path, monkeypatch
             others[0] = write_recording(made_steps(count=20), tmp_path)
         save(file, table, **given)
 
-    monkeypatch.setattr("surgsim_env.live.recording.np.savetxt", meanwhile)
+    monkeypatch.setattr("surgsim_apps.live.recording.np.savetxt", meanwhile)
     assert write_recording(made_steps(count=30), tmp_path) == "30 steps written to recording-2.csv"
     assert others == ["20 steps written to recording-1.csv"]
     assert [len(read_motion(tmp_path / f"recording-{number}.csv").time) for number in (1, 2)] == [20, 30]

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgsim_env.haptics.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
-from surgsim_env.live.exchange_records import LiveError, RecordedSteps, SharedRecord
+from surgsim_apps.haptics.pacing import CLASS_WIDTH, TIMING, Pacer, PaceSettings, quantile, timeliness
+from surgsim_apps.live.exchange_records import LiveError, RecordedSteps, SharedRecord
 
 PAIR = np.dtype([("one", "f8", (500,)), ("other", "f8", (500,))])
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from surgsim_apps.haptics.device import DevicePose
+from surgsim_apps.haptics.loop import HapticLoop
+from surgsim_apps.haptics.settings import HapticSettings
+from surgsim_apps.live.organ_choice import OrganChoice, chosen_organ, live_scene
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.haptics.device import DevicePose
-from surgsim_env.haptics.loop import HapticLoop
-from surgsim_env.haptics.settings import HapticSettings
-from surgsim_env.live.organ_choice import OrganChoice, chosen_organ, live_scene
 from surgsim_env.scene.anatomy import ADDED_MASS_SHARE, load_anatomy
 from surgsim_env.scene.load import make_scene
 from tests.live.protocol_client import press_path

@@ -12,7 +12,16 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-BUILD_INPUTS = ("pyproject.toml", "README.md", "LICENSE", "msdm_core", "surgsim_env", "scenes", "agents")
+BUILD_INPUTS = (
+    "pyproject.toml",
+    "README.md",
+    "LICENSE",
+    "msdm_core",
+    "surgsim_env",
+    "surgsim_apps",
+    "scenes",
+    "agents",
+)
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from importlib import metadata
 
 from packaging.requirements import Requirement
 
-from surgsim_env.cli import doctor
-from surgsim_env.cli.main import main
+from surgsim_apps.cli import doctor
+from surgsim_apps.cli.main import main
 from surgsim_env.rendering import gl
 
 

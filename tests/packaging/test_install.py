@@ -26,7 +26,7 @@ def shipped_files(folder: Path) -> set[str]:
 
 def test_wheel_holds_the_packages_their_data_and_nothing_else(wheel):
     names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
-    assert {Path(name).parts[0] for name in names} == {"msdm_core", "surgsim_env"}
+    assert {Path(name).parts[0] for name in names} == {"msdm_core", "surgsim_apps", "surgsim_env"}
     assets = "surgsim_env/assets/"
     shipped = {name.removeprefix(assets) for name in names if name.startswith(assets)}
     agents = {f"agents/{part}/{name}" for part in AGENTS for name in shipped_files(REPOSITORY / "agents" / part)}

@@ -3,7 +3,7 @@
 import numpy as np
 
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import press
+from surgsim_env.palpation.site_press import press
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 

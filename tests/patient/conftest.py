@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 from tests.patient.scans import LABELS, scan
 
 

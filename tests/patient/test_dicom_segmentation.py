@@ -5,7 +5,7 @@ import pydicom
 import pytest
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.label_image import parse_labels, read_label_image
+from surgsim_apps.patient.label_image import parse_labels, read_label_image
 from tests.patient.scans import MIDDLE, check_organ, labels_on
 from tests.patient.segmentation_object import item, write_segmentation
 

@@ -8,7 +8,7 @@ import pytest
 
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.meshing.lattice_meshing import box_mesh
-from surgsim_env.patient.facing import MARGIN_DEG, faced_note, facing_approach
+from surgsim_apps.patient.facing import MARGIN_DEG, faced_note, facing_approach
 from surgsim_env.scene.load import make_scene
 
 USUAL = (0.0, 0.0, -1.0)

@@ -11,14 +11,14 @@ from msdm_core.mesh.carriers import find_carriers
 from msdm_core.mesh.surface import check_surface, surface_volume
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from msdm_core.meshing.segmentation_meshing import smoothed_share
-from surgsim_env.palpation.surface_drawing import organ_patches
-from surgsim_env.patient.fine_surface import (
+from surgsim_apps.patient.fine_surface import (
     fewer_triangles,
     fitted_surface,
     level_surface,
     split_edges,
     surface_area,
 )
+from surgsim_apps.reports.surface_drawing import organ_patches
 from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 from surgsim_env.palpation import chart
-from surgsim_env.palpation.press import press_alone, press_phases
+from surgsim_env.palpation.site_press import press_alone, press_phases
 from surgsim_env.scene.load import load_scene
 from tests.patient.surfaces import ball
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surgsim_env.patient.label_image import LabelImage, clean_labels
-from surgsim_env.patient.label_readers import ImageGeometry
+from surgsim_apps.patient.label_image import LabelImage, clean_labels
+from surgsim_apps.patient.label_readers import ImageGeometry
 
 
 def image_of(tags, names):

@@ -8,7 +8,7 @@ import pytest
 import SimpleITK
 
 from msdm_core.errors import MeshError
-from surgsim_env.patient.label_image import parse_labels, read_label_image
+from surgsim_apps.patient.label_image import parse_labels, read_label_image
 from tests.patient.scans import affine_of, check_organ, labels_on, write_nifti
 
 BOTH = parse_labels("liver=1,lesion=2")

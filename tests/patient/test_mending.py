@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from msdm_core.mesh_files.mesh_io import read_mesh
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
 from tests.patient.surfaces import ball

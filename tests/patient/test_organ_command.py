@@ -7,9 +7,9 @@ import pytest
 import surgsim_env  # noqa: F401
 from msdm_core.mesh.quality import mesh_quality
 from msdm_core.mesh_files.mesh_io import read_mesh
-from surgsim_env.cli.main import main
-from surgsim_env.patient.materials import organ_material, region_material
-from surgsim_env.patient.patient_scene import _check_moduli
+from surgsim_apps.cli.main import main
+from surgsim_apps.patient.materials import organ_material, region_material
+from surgsim_apps.patient.patient_scene import _check_moduli
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
 from tests.patient.scans import LABELS, LESIONS, MIDDLE, ORGAN_VOLUME, scan

@@ -3,7 +3,7 @@
 import pytest
 import trimesh
 
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 from tests.patient.scans import LABELS, scan
 from tests.patient.surfaces import ball
 

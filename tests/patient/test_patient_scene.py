@@ -3,10 +3,10 @@
 import pytest
 import trimesh
 
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
+from surgsim_apps.palpate.job import plan_sites
+from surgsim_apps.patient.materials import is_lesion, organ_material, region_material
 from surgsim_env.envs.ids import PalpateEnv
-from surgsim_env.palpation.job import plan_sites
-from surgsim_env.patient.materials import is_lesion, organ_material, region_material
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
 
@@ -37,7 +37,7 @@ def test_materials_go_by_names(region, organ, lesion, modulus, source):
 @pytest.mark.slow
 def test_a_thin_organ_is_pressed_all_over_and_may_have_no_room_for_hidden_lesions(tmp_path, capsys, monkeypatch):
     """A plate of 16 mm, pressed 3.8 mm deep: less than five depths, more than three; lesions of 29 mm and more."""
-    monkeypatch.setattr("surgsim_env.patient.patient_scene.LESION_SHRINKS", (1.5,))
+    monkeypatch.setattr("surgsim_apps.patient.patient_scene.LESION_SHRINKS", (1.5,))
     trimesh.creation.box((50.0, 40.0, 16.0)).export(tmp_path / "liver.stl")
     out = tmp_path / "a.vtu"
     given = ["organ", str(tmp_path / "liver.stl"), "--length-unit", "mm", "--cell-size", "0.004"]

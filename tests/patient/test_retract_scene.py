@@ -12,8 +12,8 @@ import surgsim_env  # noqa: F401
 from msdm_core.mesh_files.mesh_io import read_mesh
 from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import mesh_surface
-from surgsim_env.cli.main import main
-from surgsim_env.patient.retract_scene import (
+from surgsim_apps.cli.main import main
+from surgsim_apps.patient.retract_scene import (
     JAW_OPENING,
     JAW_PLAY,
     OVERLAP_LEAST,

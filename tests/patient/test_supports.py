@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from msdm_core.meshing.lattice_meshing import box_mesh
-from surgsim_env.patient.supports import held_text, organ_anchors
+from surgsim_apps.patient.supports import held_text, organ_anchors
 
 MESH = box_mesh((0.06, 0.05, 0.10), (6, 5, 10))
 FRONT = (0.0, 1.0, 0.0)

@@ -7,9 +7,9 @@ from msdm_core.errors import MeshError
 from msdm_core.mesh.tet_mesh import TetMesh
 from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
 from msdm_core.meshing.lattice_meshing import box_mesh
-from surgsim_env.cli.main import main
-from surgsim_env.patient.label_image import parse_labels
-from surgsim_env.patient.tet_files import patient_of_tets, read_tets, surfaces_of_tets
+from surgsim_apps.cli.main import main
+from surgsim_apps.patient.label_image import parse_labels
+from surgsim_apps.patient.tet_files import patient_of_tets, read_tets, surfaces_of_tets
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
 

@@ -7,11 +7,11 @@ import pytest
 
 from msdm_core.mesh.surface import outward_facing
 from msdm_core.meshing.segmentation_meshing import FineFace, fill_labels
-from surgsim_env.cli.main import main
-from surgsim_env.palpation.scene_options import SceneOptions
-from surgsim_env.patient.lesion_room import lack_of_room, sample_face
-from surgsim_env.patient.meshers import Cells, mesh_surfaces, read_surfaces
-from surgsim_env.patient.touch import plan_touch
+from surgsim_apps.cli.main import main
+from surgsim_apps.palpate.scene_options import SceneOptions
+from surgsim_apps.patient.lesion_room import lack_of_room, sample_face
+from surgsim_apps.patient.meshers import Cells, mesh_surfaces, read_surfaces
+from surgsim_apps.patient.touch import plan_touch
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import LesionDraw

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgsim_env.patient.surface_files import voxels_inside
+from surgsim_apps.patient.surface_files import voxels_inside
 
 STEP = 0.01
 # Of a block along its edges; its faces lie half way between voxels' centres, the first of which are at 0.

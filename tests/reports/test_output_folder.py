@@ -2,7 +2,7 @@
 
 import pytest
 
-from surgsim_env.reports.output_folder import output_folder
+from surgsim_apps.reports.output_folder import output_folder
 
 NAMES = ["a.csv", "b.png", "images/c.png"]
 

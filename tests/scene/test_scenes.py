@@ -14,7 +14,7 @@ from msdm_core.material.fitting import spring_fit
 from msdm_core.mesh.ordering import spring_order
 from msdm_core.organ.stability import stable_dt
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.palpation.press import scan
+from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import ADDED_MASS_SHARE, load_anatomy, with_added_mass
 from surgsim_env.scene.load import make_scene, scene_from_table, scenes_folder
 from surgsim_env.scene.model import substeps_needed

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401  (registers the environments)
-from surgsim_env.cli.main import main
+from surgsim_apps.cli.main import main
 from surgsim_env.scripting import (
     AwaitEnd,
     CloseJaw,

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from surgsim_env.validation import suite
-from surgsim_env.validation.row import Case, Row, bounded, compare
+from surgsim_apps.validation import suite
+from surgsim_apps.validation.row import Case, Row, bounded, compare
 
 PAGE = (Path(__file__).parents[2] / "docs" / "validation.md").read_text(encoding="utf-8")
 # Cases of a quick run that take more than a second each.

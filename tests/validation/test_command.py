@@ -2,9 +2,9 @@
 
 import pytest
 
-from surgsim_env.cli.main import main
-from surgsim_env.validation import suite
-from surgsim_env.validation.row import Case, Row, compare
+from surgsim_apps.cli.main import main
+from surgsim_apps.validation import suite
+from surgsim_apps.validation.row import Case, Row, compare
 
 
 def wrong() -> list[Row]:

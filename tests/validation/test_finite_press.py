@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from msdm_core.material.regions import Material
+from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh, neo_hookean
 from surgsim_env.scene.palpable_surface import hertz_force, hidden_share
-from surgsim_env.validation.finite_press import RIGID, PressedLayer, layer_mesh, neo_hookean
 
 
 def test_the_stress_and_its_slope_are_those_of_the_energy():

@@ -8,8 +8,8 @@ from msdm_core.material.regions import Damping, Material
 from msdm_core.material.tissue_law import Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from surgsim_env.validation.hyperelastic import OrganBlock, QuadraticBlock
-from surgsim_env.validation.statics import linear_organ
+from surgsim_apps.validation.hyperelastic import OrganBlock, QuadraticBlock
+from surgsim_apps.validation.statics import linear_organ
 
 SIZE = (0.03, 0.03, 0.03)
 # E 2900 Pa, nu 0.45.

@@ -6,7 +6,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import spsolve
 
 from msdm_core.material.tissue_law import Relaxation
-from surgsim_env.validation.relaxation import ViscoelasticBody, spring_creep
+from surgsim_apps.validation.relaxation import ViscoelasticBody, spring_creep
 from tests.core.measures import loss_tangent
 
 ARMS = Relaxation(relative_moduli=(0.3, 0.3, 0.3), times=(0.05, 0.5, 5.0))

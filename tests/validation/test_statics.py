@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from msdm_core.organ.stability import apply_stiffness
-from surgsim_env.validation.dynamics import organs
-from surgsim_env.validation.statics import assemble_stiffness
+from surgsim_apps.validation.dynamics import organs
+from surgsim_apps.validation.statics import assemble_stiffness
 
 
 @pytest.mark.parametrize("name", ["springs", "nu 0.45", "capsule and lesion"])

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from surgsim_env.validation.friction import GAUGE, HELD, LENGTH, MODULUS, WIDTH, HangingStrip, grip, gripped_strip, slip
+from surgsim_apps.validation.friction import (
+    GAUGE,
+    HELD,
+    LENGTH,
+    MODULUS,
+    WIDTH,
+    HangingStrip,
+    grip,
+    gripped_strip,
+    slip,
+)
 
 
 @pytest.fixture

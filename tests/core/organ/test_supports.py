@@ -13,7 +13,7 @@ from msdm_core.organ.measure import kinetic_energy, potential_energy, support_fo
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.stepping import advance, advance_organ
 from msdm_core.organ.support import Support, SupportLaw
-from surgsim_env.validation.friction import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
+from surgsim_apps.validation.friction import FLOOR, GRAVITY, crept, free_block, on_incline, run, slid
 from tests.core import oracle
 from tests.core.lanes.abreast import advance_lanes, rest_lanes
 from tests.core.measures import momentum

@@ -1,0 +1,51 @@
+"""A picture of one arm with its meshes, its shaft in a trocar."""
+
+from itertools import product
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.mesh import FloatArray
+from surgsim_env.instruments import Arm
+from surgsim_env.rendering import DrawnCapsule, draw_still, filling, shown_geoms
+
+SIZE, FIELD_OF_VIEW = (1600, 1200), 30.0
+# Share of the picture that the arm fills.
+SHARE = 0.94
+# The view is from beside the arm, by these amounts from the trocar's side and from above.
+AHEAD, ABOVE = 0.5, 0.35
+TROCAR_RADIUS, TROCAR_COLOUR = 0.008, (0.95, 0.75, 0.2, 1.0)
+CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+
+
+def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
+    """A picture (1200, 1600, 3) of an arm at joint values (n,) [rad or m], its trocar as a yellow ball.
+
+    Raises:
+        NoGLError: there is no OpenGL; names the packages that are missing.
+    """
+    data = mujoco.MjData(arm.model)
+    arm.write(data, joints)
+    mujoco.mj_kinematics(arm.model, data)
+    tip, up = arm.tip_pose(joints).position, arm.port.rotation[:, 2]
+    points = np.concatenate([_box_corners(arm.model, data), [arm.trocar, tip]])
+    aside = np.cross(up, arm.trocar - points.mean(axis=0))
+    # Of an arm whose middle is above the trocar every side shows as much.
+    length = float(np.linalg.norm(aside))
+    aside = aside / length if length > 1e-6 else arm.port.rotation[:, 1]
+    direction: Any = aside + AHEAD * np.cross(aside, up) + ABOVE * up
+    camera = filling(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
+    ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
+    return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]
+
+
+def _box_corners(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
+    """Corners [m] (n, 3) of boxes around the geoms that are shown."""
+    # A plane has no bounds.
+    shown = [geom for geom in shown_geoms(model) if model.geom_rbound[geom] > 0.0]
+    boxes = model.geom_aabb[shown]
+    local = boxes[:, None, :3] + CORNERS * boxes[:, None, 3:]
+    rotation = data.geom_xmat[shown].reshape(-1, 3, 3)
+    return (data.geom_xpos[shown][:, None] + np.einsum("gij,gcj->gci", rotation, local)).reshape(-1, 3)

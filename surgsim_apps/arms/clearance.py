@@ -1,0 +1,267 @@
+"""Exact distances of capsules, and clearance of arms from organ, body wall and each other, many at once.
+
+A capsule is a segment with a radius: its clearance from anything is the distance of the segment less the radii. Where
+segments meet, the distance is 0 and the clearance is minus the radii: the depth of an overlap is not computed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msdm_core.mesh import FloatArray, IntArray
+from surgsim_apps.arms.kinematics import BatchKinematics, Chain, cross, dot
+from surgsim_apps.arms.ports import Ports
+
+# Triangles of one cluster; pairs of segment and triangle that are computed at once.
+CLUSTER_SIZE = 24
+PAIRS_AT_ONCE = 400_000
+# Parts of an arm this near to the tip (and its ball) may touch the organ [m].
+TIP_ZONE = 0.005
+# Parts of two arms this near to a common point are left out of their distance [m]: the tips meet there.
+MEETING_ZONE = 0.020
+
+
+def segment_distance(first: ArrayLike, second: ArrayLike) -> FloatArray:
+    """Distances between segments (..., 2, 3) and segments (..., 2, 3), broadcast [m]; points are segments too.
+
+    Least |p0 + s u - q0 - t v| for 0 <= s, t <= 1: the pair of lines where both feet lie inside, else an end against
+    the other segment (C. Ericson, Real-Time Collision Detection, 5.1.9).
+    """
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    u, v, w = a[..., 1, :] - a[..., 0, :], b[..., 1, :] - b[..., 0, :], a[..., 0, :] - b[..., 0, :]
+    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
+    determinant = uu * vv - uv * uv
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s, t = (uv * vw - vv * uw) / determinant, (uu * vw - uv * uw) / determinant
+        inside = (determinant > 1e-14 * uu * vv) & (s > 0.0) & (s < 1.0) & (t > 0.0) & (t < 1.0)
+    ends = np.minimum(
+        np.minimum(point_segment_distance(a[..., 0, :], b), point_segment_distance(a[..., 1, :], b)),
+        np.minimum(point_segment_distance(b[..., 0, :], a), point_segment_distance(b[..., 1, :], a)),
+    )
+    between = w + np.where(inside, s, 0.0)[..., None] * u - np.where(inside, t, 0.0)[..., None] * v
+    return np.where(inside, np.minimum(np.sqrt(dot(between, between)), ends), ends)
+
+
+def point_segment_distance(point: FloatArray, segment: FloatArray) -> FloatArray:
+    """Distances of points (..., 3) from segments (..., 2, 3), broadcast [m]."""
+    start, span = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
+    length = dot(span, span)
+    along = np.clip(dot(point - start, span) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+    gap = point - start - along[..., None] * span
+    return np.sqrt(dot(gap, gap))
+
+
+def segment_triangle_distance(segment: FloatArray, corners: FloatArray) -> FloatArray:
+    """Distances of segments (n, 2, 3) from triangles (n, 3, 3) [m], (n,); 0 where they cross."""
+    edges = corners[:, [[0, 1], [1, 2], [2, 0]]]
+    least = segment_distance(segment[:, None], edges).min(axis=1)
+    normal = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normal / np.linalg.norm(normal, axis=1)[:, None]
+    height = dot(segment - corners[:, :1], normal[:, None])
+    for end in (0, 1):
+        foot = segment[:, end] - height[:, end, None] * normal
+        least = np.where(_within(foot, corners, normal), np.minimum(least, np.abs(height[:, end])), least)
+    span = height[:, 0] - height[:, 1]
+    share = height[:, 0] / np.where(span == 0.0, 1.0, span)
+    crossing = segment[:, 0] + share[:, None] * (segment[:, 1] - segment[:, 0])
+    crosses = (height[:, 0] * height[:, 1] <= 0.0) & (span != 0.0) & _within(crossing, corners, normal)
+    return np.where(crosses, 0.0, least)
+
+
+def _within(point: FloatArray, corners: FloatArray, normal: FloatArray) -> NDArray[np.bool_]:
+    """Whether points of the triangles' planes (n, 3) lie in the triangles (n, 3, 3)."""
+    inside = np.ones(len(point), dtype=bool)
+    for one, two in ((0, 1), (1, 2), (2, 0)):
+        inside &= dot(cross(corners[:, two] - corners[:, one], point - corners[:, one]), normal) >= 0.0
+    return inside
+
+
+class ClusteredSurface:
+    """A triangle surface for distances: its triangles in clusters, most of which their bounding balls rule out."""
+
+    def __init__(self, points: FloatArray, triangles: IntArray) -> None:
+        """Take a surface's points (n, 3) [m] and triangles (m, 3)."""
+        corners = points[triangles]
+        order = _clustered(corners.mean(axis=1), np.arange(len(corners)))
+        self._first = np.cumsum([0, *(len(one) for one in order)])
+        self.corners = corners[np.concatenate(order)]
+        self._centre, self._radius = _balls(self.corners[:, None])
+        self._middle, self._extent = (part[0] for part in _balls(self.corners.reshape(1, 1, -1, 3)))
+        parts = [self.corners[low:high].reshape(1, -1, 3) for low, high in zip(self._first[:-1], self._first[1:])]
+        balls = [_balls(part[:, None]) for part in parts]
+        self._cluster_centre = np.concatenate([centre for centre, _ in balls])
+        self._cluster_radius = np.concatenate([radius for _, radius in balls])
+
+    def distance(self, segments: FloatArray, cap: float = np.inf) -> FloatArray:
+        """Distances of segments (n, 2, 3) from the surface [m], (n,); cap where they are at least that.
+
+        A small cap is quick: triangles that are certainly further away are skipped.
+        """
+        result = np.full(len(segments), cap)
+        near = np.flatnonzero(point_segment_distance(self._middle, segments) - self._extent < cap)
+        chunk = max(1, PAIRS_AT_ONCE // len(self._cluster_radius))
+        for low in range(0, len(near), chunk):
+            rows = near[low : low + chunk]
+            result[rows] = self._some(segments[rows], cap)
+        return result
+
+    def _some(self, segments: FloatArray, cap: float) -> FloatArray:
+        to_centre = point_segment_distance(self._cluster_centre[None], segments[:, None])
+        # Every ball contains points of the surface: the nearest is no further away than a ball's far side.
+        most = np.minimum((to_centre + self._cluster_radius).min(axis=1), cap)
+        row, cluster = np.nonzero(to_centre - self._cluster_radius < most[:, None])
+        count = self._first[cluster + 1] - self._first[cluster]
+        pair_row = np.repeat(row, count)
+        offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        triangle = np.repeat(self._first[cluster], count) + offset
+        result = np.full(len(segments), cap)
+        to_ball = np.empty(len(pair_row))
+        for low in range(0, len(pair_row), PAIRS_AT_ONCE):
+            part = slice(low, low + PAIRS_AT_ONCE)
+            to_ball[part] = point_segment_distance(self._centre[triangle[part]], segments[pair_row[part]])
+        np.minimum.at(most, pair_row, to_ball + self._radius[triangle])
+        kept = to_ball - self._radius[triangle] < most[pair_row]
+        pair_row, triangle = pair_row[kept], triangle[kept]
+        for low in range(0, len(pair_row), PAIRS_AT_ONCE):
+            part = slice(low, low + PAIRS_AT_ONCE)
+            found = segment_triangle_distance(segments[pair_row[part]], self.corners[triangle[part]])
+            np.minimum.at(result, pair_row[part], found)
+        return result
+
+
+def _clustered(centres: FloatArray, members: NDArray) -> list[NDArray]:
+    """Members split in halves along their longest side until few are left in each part."""
+    if len(members) <= CLUSTER_SIZE:
+        return [members]
+    side = int(np.argmax(np.ptp(centres[members], axis=0)))
+    order = members[np.argsort(centres[members, side], kind="stable")]
+    half = len(order) // 2
+    return [*_clustered(centres, order[:half]), *_clustered(centres, order[half:])]
+
+
+def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Balls about points (n, 1, k, 3): middle of the box (n, 3) and distance of the furthest point (n,)."""
+    flat = corners.reshape(len(corners), -1, 3)
+    centre = 0.5 * (flat.min(axis=1) + flat.max(axis=1))
+    # A little more than the furthest, so that rounding never rules out the nearest triangle.
+    return centre, np.linalg.norm(flat - centre[:, None], axis=2).max(axis=1) * (1.0 + 1e-9) + 1e-12
+
+
+def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The parts of segments (..., 2, 3) outside balls about centres (..., 3) [m]: two each, and which of them are any.
+
+    Returns:
+        parts (..., 2, 2, 3), before and after the ball, and whether each has anything left (..., 2).
+    """
+    start, span = segments[..., 0, :], segments[..., 1, :] - segments[..., 0, :]
+    offset = start - centre
+    a, b, c = dot(span, span), dot(span, offset), dot(offset, offset) - radius**2
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    safe = np.where(a > 0.0, a, 1.0)
+    enter = np.where(a > 0.0, (-b - root) / safe, np.where(c < 0.0, -1.0, 2.0))
+    leave = np.where(a > 0.0, (-b + root) / safe, np.where(c < 0.0, 2.0, 2.0))
+    missed = (b * b - a * c <= 0.0) & (a > 0.0)
+    before = np.where(missed, 1.0, np.clip(enter, 0.0, 1.0))
+    after = np.where(missed, 1.0, np.clip(leave, 0.0, 1.0))
+    low = np.stack([np.zeros_like(before), after], axis=-1)
+    high = np.stack([before, np.ones_like(after)], axis=-1)
+    parts = start[..., None, None, :] + np.stack([low, high], axis=-1)[..., None] * span[..., None, None, :]
+    left = high > low
+    left[..., 0] |= (a == 0.0) & (c >= 0.0)
+    return parts, left
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Obstacles of an arm: organ at rest and body wall; `ball` is the radius of its tip [m], which may touch."""
+
+    organ: ClusteredSurface
+    ports: Ports
+    ball: float
+
+    def organ_clearance(self, kinematics: BatchKinematics, chain: Chain, *, exact: bool) -> FloatArray:
+        """Distance of all shapes outside the tip's zone from the organ [m], (n,).
+
+        Not exact: 0 or more means clear, less means touching.
+        """
+        radius = kinematics.arm.shape_radius
+        parts, left = outside_ball(chain.shape_ends, chain.tip[:, None], self.ball + TIP_ZONE)
+        row, shape, part = np.nonzero(left)
+        cap = np.inf if exact else float(radius.max())
+        gaps = self.organ.distance(parts[row, shape, part], cap) - radius[shape]
+        result = np.full(chain.shape_ends.shape[:2], np.inf)
+        np.minimum.at(result, (row, shape), gaps)
+        return result.min(axis=1)
+
+    def wall_clearance(self, kinematics: BatchKinematics, chain: Chain) -> FloatArray:
+        """Distance of all shapes outside the port's hole from the body wall [m], (n,)."""
+        gaps = wall_clearance(self.ports, chain.shape_ends, kinematics.trocar) - kinematics.arm.shape_radius
+        return gaps.min(axis=1)
+
+
+def wall_clearance(ports: Ports, segments: FloatArray, trocar: FloatArray) -> FloatArray:
+    """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf where all lies in the hole.
+
+    With heights from h0 to h1 above the wall's middle surface and a thickness t:
+    max(h0 - t/2, -t/2 - h1): how far a segment is, or would have to be moved to be, clear of it.
+    """
+    wall, half = ports.wall, 0.5 * ports.wall.thickness
+    parts, left = outside_ball(segments, trocar, wall.hole)
+    if wall.plate:
+        middle = 0.5 * (np.array(ports.left.point) + np.array(ports.right.point))
+        heights = (parts - middle) @ ports.wall_normal
+        low, high = heights.min(axis=-1), heights.max(axis=-1)
+    else:
+        centre = ports.dome_centre
+        low = point_segment_distance(centre, parts) - wall.radius
+        high = np.sqrt(dot(parts - centre, parts - centre)).max(axis=-1) - wall.radius
+    return np.where(left, np.maximum(low - half, -half - high), np.inf).min(axis=-1)
+
+
+def split_at_trocar(kinematics: BatchKinematics, chain: Chain) -> tuple[FloatArray, FloatArray]:
+    """Shapes inside and outside the body, each (n, n_shape, 2, 3) [m]; NaN where a shape has no part there.
+
+    The shaft and the bodies beyond it are cut by the plane through the trocar across the shaft; all others are outside.
+    """
+    ends = chain.shape_ends
+    height = dot(ends - chain.near[:, None, None], chain.along[:, None, None])
+    span = height[..., 1] - height[..., 0]
+    share = np.clip(-height[..., 0] / np.where(span == 0.0, 1.0, span), 0.0, 1.0)
+    cut = ends[..., 0, :] + share[..., None] * (ends[..., 1, :] - ends[..., 0, :])
+    inside, outside = ends.copy(), ends.copy()
+    for end in (0, 1):
+        beyond = height[..., end] > 0.0
+        inside[..., end, :] = np.where(beyond[..., None], ends[..., end, :], cut)
+        outside[..., end, :] = np.where(beyond[..., None], cut, ends[..., end, :])
+    within, without = (height > 0.0).any(axis=-1), (height <= 0.0).any(axis=-1)
+    inside[~(within & kinematics.distal)] = np.nan
+    outside[:, ~kinematics.distal] = ends[:, ~kinematics.distal]
+    outside[~without & kinematics.distal] = np.nan
+    return inside, outside
+
+
+def arm_distances(
+    first: tuple[BatchKinematics, Chain], second: tuple[BatchKinematics, Chain], points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Smallest distances of two arms inside and outside the body [m], each (n,), their tips at the same points (n, 3).
+
+    Each arm's own trocar divides its shapes into inside and outside; parts within MEETING_ZONE of the
+    point are left out.
+    """
+    pieces = [split_at_trocar(*one) for one in (first, second)]
+    radii = [one[0].arm.shape_radius for one in (first, second)]
+    inside = []
+    for segments, _ in pieces:
+        parts, left = outside_ball(segments, points[:, None], MEETING_ZONE)
+        parts[~left] = np.nan
+        inside.append(parts.reshape(len(segments), -1, 2, 3))
+    outside = [piece[1] for piece in pieces]
+    return _least(inside, [np.repeat(radius, 2) for radius in radii]), _least(outside, radii)
+
+
+def _least(segments: list[FloatArray], radii: list[FloatArray]) -> FloatArray:
+    """Smallest clearance of two sets of capsules (n, k, 2, 3), (n, l, 2, 3) [m], (n,); inf where one set is empty."""
+    with np.errstate(invalid="ignore"):
+        gaps = segment_distance(segments[0][:, :, None], segments[1][:, None]) - radii[0][:, None] - radii[1]
+    return np.where(np.isnan(gaps), np.inf, gaps).min(axis=(1, 2))

@@ -1,0 +1,343 @@
+"""Two arms on a patient's anatomy: reach, dexterity and clearances evaluated; setups ranked; report and files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.console import Console
+
+from msdm_core.mesh import FloatArray
+from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
+from surgsim_apps.arms.kinematics import BatchKinematics
+from surgsim_apps.arms.pictures import ArmMaps, draw_arms, write_picture
+from surgsim_apps.arms.ports import Ports, default_ports, read_ports
+from surgsim_apps.arms.reach import (
+    Sites,
+    evaluate_both,
+    evaluate_reach,
+    tip_ball,
+)
+from surgsim_apps.arms.results import (
+    DISTANCES,
+    QUANTITIES,
+    RANKING_RULE,
+    REASONS,
+    SHARE_DEFINITIONS,
+    SIDES,
+    ArmsEvaluation,
+    Ranked,
+    number_text,
+    rank,
+    share_text,
+    sides,
+    spread,
+    values_of,
+    verdict,
+    worse_of_both,
+    write_points,
+)
+from surgsim_apps.arms.through_cycle import cycle_section, evaluate_cycle
+from surgsim_apps.reports.html_page import Picture, render_page
+from surgsim_apps.reports.output_folder import AnyFolder
+from surgsim_env.instruments import load_arm
+from surgsim_env.rendering import NoGLError
+from surgsim_env.scene import Anatomy, ArmDescription, Scene, load_anatomy, make_scene
+from surgsim_env.step_progress import StepProgress
+
+# Places from which each point is chosen.
+PLACES_PER_POINT = 12
+REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
+# Every file that a study can write; which pictures there are depends on the arms and OpenGL.
+RESULT_NAMES = (
+    *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, "map_reach.png"),
+    *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
+)
+Rows = list[tuple[str, ...]]
+
+
+def evaluate_arms(
+    scene: str | Path | Scene | Anatomy,
+    left: str | Path | ArmDescription,
+    right: str | Path | ArmDescription,
+    ports: str | Path | Ports | None = None,
+    *,
+    seed: int = 0,
+    count: int = 500,
+    progress: StepProgress | None = None,
+    picture: bool = False,
+) -> ArmsEvaluation:
+    """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
+
+    A scene with motions is evaluated through their cycle too: `ArmsEvaluation.cycle`.
+
+    Args:
+        scene: a scene's name, its TOML file, or what is loaded from these.
+        left: a shipped arm's name or the TOML file of one's own.
+        right: likewise.
+        ports: a ports file, or the result of `read_ports`; `default_ports` where none is given.
+        seed: draws the first point of the surface.
+        count: number of points of the surface.
+        progress: shows the steps.
+        picture: whether to draw the arms in the patient; without OpenGL there is none, `progress` says why.
+
+    Raises:
+        ValueError: one line with what is wrong in scene, arm or ports, and the way out.
+    """
+    progress = progress or StepProgress()
+    if not isinstance(scene, Anatomy):
+        scene = load_anatomy(scene if isinstance(scene, Scene) else make_scene(scene))
+    anatomy, mesh = scene, scene.mesh
+    if ports is None:
+        where = default_ports(anatomy)
+    else:
+        where = ports if isinstance(ports, Ports) else read_ports(ports)
+    where.check_outside(anatomy)
+    radius = anatomy.scene.instrument.tip_radius
+    arms = tuple(
+        load_arm(source, place.port, tip_radius=radius) for source, place in ((left, where.left), (right, where.right))
+    )
+    sites = _sites(anatomy, where, count, seed)
+    organ, reaches, around = ClusteredSurface(mesh.points, mesh.boundary_triangles), [], []
+    for side, arm in zip(SIDES, arms, strict=True):
+        with progress.step(f"the {side} arm at {len(sites.points)} points"):
+            kinematics = BatchKinematics(arm)
+            around.append(Obstacles(organ, where, tip_ball(kinematics)))
+            reaches.append(evaluate_reach(kinematics, sites, around[-1]))
+    with progress.step("both arms at once"):
+        both = evaluate_both(reaches[0], reaches[1], sites.points)
+    cycle = None
+    if anatomy.scene.motions:
+        obstacles = around[0], around[1]
+        cycle = evaluate_cycle((reaches[0], reaches[1]), both, sites, obstacles, anatomy, progress)
+    surface, triangles = anatomy.outer_surface
+    found = ArmsEvaluation(
+        points=sites.points,
+        normals=sites.normals,
+        inner=sites.inner,
+        left=reaches[0].report,
+        right=reaches[1].report,
+        both=both.reachable,
+        arm_distance_inside=both.inside,
+        arm_distance_outside=both.outside,
+        scene=anatomy.scene.name,
+        surface_points=surface,
+        surface_triangles=triangles,
+        ports=where.frames,
+        cycle=cycle,
+    )
+    if picture:
+        try:
+            found = replace(found, picture=draw_arms(found, arms, where))
+        except NoGLError as error:
+            progress.say(f"no picture: {error}")
+    return found
+
+
+def _sites(anatomy: Anatomy, ports: Ports, count: int, seed: int) -> Sites:
+    """Points of the surface, then the inner targets, whose normals point to the endoscope."""
+    trocars = np.array([ports.left.point, ports.right.point])
+    points, normals = facing_points(anatomy, trocars, count, seed)
+    inner: FloatArray = np.array([target.point for target in ports.targets], dtype=np.float64).reshape(-1, 3)
+    out = np.array(ports.endoscope.point) - inner
+    out /= np.maximum(np.linalg.norm(out, axis=1), 1e-12)[:, None]
+    return Sites(
+        np.concatenate([points, inner]),
+        np.concatenate([normals, out]),
+        np.arange(len(points) + len(inner)) >= len(points),
+    )
+
+
+def facing_points(anatomy: Anatomy, ports: ArrayLike, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Points on the organ's surface [m] and unit outward normals there, each (count, 3).
+
+    A triangle faces the ports if the middle of the ports (n_port, 3) [m] lies on its outer side; anchored triangles are
+    left out. Triangles are quartered until there are many small ones; from their centroids each
+    next point is the one furthest from all before it (farthest-point sampling), the first drawn from the seed.
+
+    Raises:
+        ValueError: no triangle faces the ports.
+    """
+    corners = anatomy.mesh.points[anatomy.mesh.boundary_triangles]
+    held = np.isin(anatomy.mesh.boundary_triangles, anatomy.anchors).all(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    middle = np.asarray(ports, dtype=np.float64).mean(axis=0)
+    facing = ~held & (((middle - corners.mean(axis=1)) * normals).sum(axis=1) > 0.0)
+    if not facing.any():
+        raise ValueError("no free part of the organ's surface faces the ports: move the ports")
+    corners, normals = corners[facing], normals[facing]
+    while len(corners) < PLACES_PER_POINT * count:
+        corners, normals = _quartered(corners), np.repeat(normals, 4, axis=0)
+    centres = corners.mean(axis=1)
+    # Ranked by distance from the ports: a mirrored organ has mirrored points, in the same order.
+    ranked = np.argsort(np.linalg.norm(centres - middle, axis=1), kind="stable")
+    chosen = _spread(centres, count, int(ranked[np.random.default_rng(seed).integers(len(centres))]))
+    return centres[chosen], normals[chosen]
+
+
+def _quartered(corners: FloatArray) -> FloatArray:
+    """Each triangle (n, 3, 3) cut into four congruent ones."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+    parts = [np.stack(three, axis=1) for three in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    return np.stack(parts, axis=1).reshape(-1, 3, 3)
+
+
+def _spread(points: FloatArray, count: int, first: int) -> np.ndarray:
+    """Indices of points, each the furthest from those before it, (count,)."""
+    chosen = [first]
+    nearest = ((points - points[first]) ** 2).sum(axis=1)
+    for _ in range(count - 1):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+    return np.array(chosen)
+
+
+@dataclass(frozen=True)
+class ArmSetup:
+    """Two arms at their ports.
+
+    Fields:
+        name, what: as a ranking shows them
+        left, right: descriptions of the arms
+        ports: theirs and the endoscope's
+    """
+
+    name: str
+    what: str
+    left: ArmDescription
+    right: ArmDescription
+    ports: Ports
+
+
+def run_study(
+    setups: Sequence[ArmSetup],
+    anatomy: Anatomy,
+    folder: AnyFolder,
+    console: Console,
+    *,
+    points: int,
+    seed: int,
+    command: str,
+) -> list[str]:
+    """Evaluate the setups, rank them if there are several, and write report, points, heat maps and picture.
+
+    Args:
+        setups: the one that is reported first, then those it is compared with.
+        anatomy: of the organ.
+        folder: for the files.
+        console: for progress and results.
+        points: number of points of the organ to be tried.
+        seed: of the points.
+        command: the command line, for the report.
+
+    Returns:
+        The names of the files.
+    """
+    found = []
+    with StepProgress(console) as progress:
+        for setup in setups:
+            progress.say(f"{setup.name}: {setup.what}")
+            found.append(
+                evaluate_arms(
+                    anatomy,
+                    setup.left,
+                    setup.right,
+                    setup.ports,
+                    seed=seed,
+                    count=points,
+                    progress=progress,
+                    picture=setup is setups[0],
+                )
+            )
+        first = found[0]
+        maps = ArmMaps(first).write_all(folder, progress)
+    ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
+    write_points(first, folder / POINTS_NAME)
+    pictures = [] if first.picture is None else [write_picture(first.picture, folder / PICTURE_NAME)]
+    write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
+    console.print(verdict(first), highlight=False)
+    return [REPORT_NAME, POINTS_NAME, *(one.name for one in (*pictures, *maps))]
+
+
+def write_report(
+    evaluation: ArmsEvaluation,
+    path: Path,
+    *,
+    pictures: Sequence[Picture],
+    maps: Sequence[Picture],
+    command: str,
+    ranking: Sequence[Ranked] = (),
+) -> None:
+    """Write the report.
+
+    Args:
+        evaluation: what was found.
+        path: of the file.
+        pictures: of the arms in the patient.
+        maps: heat maps.
+        command: the command that makes this report.
+        ranking: of several placements or robots; left out if there is none.
+    """
+    page = render_page(
+        "arms.html.j2",
+        title=f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)",
+        verdict=verdict(evaluation),
+        ranking=ranking,
+        ranking_rule=RANKING_RULE,
+        number_text=number_text,
+        pictures=pictures,
+        maps=maps,
+        has_targets=evaluation.inner.any(),
+        shares=_shares(evaluation),
+        values=_values(evaluation),
+        distances=[(title, *spread(getattr(evaluation, field)).texts(1e3, 1)) for field, title, _ in DISTANCES],
+        reasons=_reasons(evaluation),
+        cycle=cycle_section(evaluation),
+        definitions=_definitions(),
+        command=command,
+    )
+    path.write_text(page, encoding="utf-8", newline="\n")
+
+
+def _shares(evaluation: ArmsEvaluation) -> Rows:
+    """Shares of points that the left arm, the right arm and both at once reach."""
+    groups = [("on the surface", ~evaluation.inner), ("inside the organ", evaluation.inner)]
+    masks = [evaluation.left.reachable, evaluation.right.reachable, evaluation.both]
+    return [
+        (f"{name} ({int(group.sum())} points)", *(share_text(mask[group]) for mask in masks))
+        for name, group in groups
+        if group.any()
+    ]
+
+
+def _values(evaluation: ArmsEvaluation) -> list[tuple[str, list[tuple[str, str, str]]]]:
+    """Least, median and greatest of each quantity for each arm, and for the worse arm where both reach at once."""
+    rows = []
+    for quantity in QUANTITIES:
+        groups = [values_of(arm, quantity) for _, arm in sides(evaluation)]
+        groups.append(worse_of_both(evaluation, quantity))
+        rows.append((quantity.label, [spread(values).texts(quantity.scale, quantity.digits) for values in groups]))
+    return rows
+
+
+def _reasons(evaluation: ArmsEvaluation) -> Rows:
+    """Numbers and shares of points by their reason, for both arms."""
+    rows = []
+    for index, reason in enumerate(REASONS):
+        masks = [arm.reason == index for _, arm in sides(evaluation)]
+        rows.append((reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
+    return rows
+
+
+def _definitions() -> list[tuple[str, str]]:
+    """Names of all figures of an evaluation and what they mean."""
+    return [
+        ("reachable", SHARE_DEFINITIONS[0][1]),
+        ("both at once", SHARE_DEFINITIONS[1][1]),
+        *((quantity.label, quantity.definition) for quantity in QUANTITIES),
+        *((f"{title} [mm]", definition) for _, title, definition in DISTANCES),
+        ("the worse arm", "At a point, the smaller of both arms' values where more is better, else the larger."),
+    ]

@@ -1,0 +1,387 @@
+"""A model file surveyed: which joints drive its tip, which parts are outer shapes, where a straight shaft is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
+from msdm_core.mesh import FloatArray
+from surgsim_env.instruments import (
+    MESH_FORMATS,
+    faulty_links,
+    find_mesh,
+    mesh_names,
+    read_model,
+    read_xml,
+    speed_limits,
+)
+from surgsim_env.scene import LinkInertia, Vector, nearest
+
+# Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.
+SHAPE_DENSITY, BARE_DENSITY = 1000.0, 2700.0
+# Mass of a link that states none and has no shape [kg].
+BARE_MASS = 0.01
+# A solid link's smallest thickness for its moments [m].
+THICKNESS_LEAST = 0.002
+# A part is a straight shaft if it is this long and no thicker [m].
+SHAFT_LENGTH_LEAST, SHAFT_RADIUS_MOST = 0.10, 0.008
+# Axes that pass a point within this distance meet there [m].
+MEETING_TOLERANCE = 1e-4
+# Words in the names of frames at a tool's tip.
+TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
+# As numbers: a numpy integer equals no member of MuJoCo's enumerations.
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+SPHERE, CAPSULE, CYLINDER, ELLIPSOID, BOX, MESH, PLANE, FIELD = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("SPHERE", "CAPSULE", "CYLINDER", "ELLIPSOID", "BOX", "MESH", "PLANE", "HFIELD")
+)
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A capsule in a body's frame, or a ball where both ends are the same.
+
+    Fields:
+        start, end: of its axis [m]                                                 (3,)
+        radius: [m]                                                                 scalar
+    """
+
+    start: FloatArray
+    end: FloatArray
+    radius: float
+
+    @property
+    def length(self) -> float:
+        """Overall length [m]."""
+        return float(norm(self.end - self.start)) + 2.0 * self.radius
+
+
+@dataclass(frozen=True)
+class RemoteCentre:
+    """A point through which a mechanism keeps its shaft.
+
+    Fields:
+        point: in the model's own frame [m]                                         (3,)
+        body: that carries the shaft
+        shaft_point, shaft_axis: in that body's frame [m], the axis towards the tip (3,)
+        joint: the slide that inserts the shaft
+    """
+
+    point: FloatArray
+    body: int
+    shaft_point: FloatArray
+    shaft_axis: FloatArray
+    joint: int
+
+
+class ModelSurvey:
+    """What a model file contains, as compiled alone.
+
+    Fields:
+        path: of the file
+        inertias: that were missing or wrong in a URDF and are made up from shapes
+        dropped_meshes: of a URDF that are not found or cannot be read
+        speed_limits: that a URDF states [rad/s or m/s]
+        model, data: of MuJoCo, at the model's initial joint values
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read and compile a file.
+
+        Raises:
+            ValueError: a file that is missing, no MJCF or URDF, or that MuJoCo refuses.
+        """
+        self.path = path
+        root = read_xml(path)
+        self.is_urdf = root.tag == "robot"
+        self.inertias: tuple[LinkInertia, ...] = ()
+        self.dropped_meshes: tuple[str, ...] = ()
+        self.speed_limits: dict[str, float] = {}
+        if self.is_urdf:
+            folder = (root.find("mujoco/compiler") or {}).get("meshdir", "")
+            found = {name: find_mesh(path, name, folder) for name in mesh_names(root)}
+            self.dropped_meshes = tuple(
+                name for name, file in found.items() if file is None or file.suffix.lower() not in MESH_FORMATS
+            )
+            self.speed_limits = speed_limits(root)
+            faults = faulty_links(root)
+            ball = [LinkInertia(name, 1.0, (0.0, 0.0, 0.0), (1e-3, 1e-3, 1e-3)) for name in faults]
+            self._compile(ball)
+            self.inertias = tuple(self._solid_link(name, *faults[name]) for name in faults)
+        self._compile(self.inertias)
+
+    def _compile(self, inertias: Sequence[LinkInertia]) -> None:
+        try:
+            self.model = read_model(self.path, inertias, self.dropped_meshes).compile()
+        except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
+            raise ValueError(f"model file {self.path}: {' '.join(str(error).split())}") from None
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _solid_link(self, name: str, mass: float, centre: FloatArray) -> LinkInertia:
+        """Mass and moments of a solid block around a link's shapes, or of a ball where it has none."""
+        points = self.body_points(self.model.body(name).id)
+        if len(points):
+            size = np.maximum(np.ptp(points, axis=0), THICKNESS_LEAST)
+            if mass == 0.0:
+                mass, centre = SHAPE_DENSITY * float(size.prod()), 0.5 * (points.min(axis=0) + points.max(axis=0))
+        else:
+            mass = mass or BARE_MASS
+            size = np.full(3, cbrt(mass / BARE_DENSITY))
+        square = size * size
+        moments = mass / 12.0 * (square.sum() - square)
+        return LinkInertia(name, mass, vector(centre), vector(moments, digits=None))
+
+    # ---- bodies and joints -----------------------------------------------------------------------------------
+
+    def body_name(self, body: int) -> str:
+        """A body's name."""
+        return self.model.body(body).name
+
+    def parents(self, body: int) -> list[int]:
+        """A body and those that carry it, from the body to the world, which is left out."""
+        found = []
+        while body:
+            found.append(body)
+            body = int(self.model.body_parentid[body])
+        return found
+
+    def body_joints(self, body: int) -> list[int]:
+        """Joints of a body."""
+        first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
+        return list(range(first, first + count))
+
+    def chain(self, body: int) -> list[int]:
+        """Joints that move a body, from the base.
+
+        Raises:
+            ValueError: there is none.
+        """
+        joints = self._joints_to(body)
+        if not joints:
+            raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
+        return joints
+
+    def find_tip(self, named: str | None) -> tuple[int, FloatArray | None]:
+        """The body of the tip and, of a frame that marks it, the tip's offset in that body [m] (3,).
+
+        Without a name it is a frame that is fixed to the last link of the longest chain of joints, or that link; where
+        a chain ends in several fingers, the link that carries them.
+
+        Raises:
+            ValueError: a name that is neither a body nor a site.
+        """
+        model = self.model
+        sites = {model.site(index).name: index for index in range(model.nsite)}
+        bodies = {self.body_name(index): index for index in range(1, model.nbody)}
+        if named is not None:
+            if named in bodies:
+                return self._marked(bodies[named])
+            if named in sites:
+                return self._at_site(sites[named])
+            known = sorted(name for name in (*bodies, *sites) if name)
+            raise ValueError(f"--tip: {self.path.name} has no link or site {named!r}{nearest(named, known)}")
+        counts = [len(self._joints_to(body)) for body in range(model.nbody)]
+        deepest = [body for body in range(model.nbody) if counts[body] == max(counts)]
+        if max(counts) == 0:
+            raise ValueError(f"model file {self.path} has no joint: name the model of an arm")
+        ends = {self._joints_to(body)[-1] for body in deepest}
+        last = int(model.jnt_bodyid[min(ends)])
+        if len(ends) > 1:
+            paths = [self.parents(int(model.jnt_bodyid[joint])) for joint in sorted(ends)]
+            last = next(body for body in paths[0] if all(body in path for path in paths))
+        fixed = [body for body in range(1, model.nbody) if self._fixed_to(body, last)]
+        marks = [index for index in range(model.nsite) if int(model.site_bodyid[index]) in fixed]
+        marks = [index for index in marks if _has_tip_word(model.site(index).name)]
+        if marks:
+            return self._at_site(marks[0])
+        frames = [body for body in fixed if body != last and _has_tip_word(self.body_name(body))]
+        return self._marked(frames[-1] if frames else last)
+
+    def _marked(self, body: int) -> tuple[int, FloatArray | None]:
+        """A body; its origin is the tip if it is a frame fixed to a link, without shapes of its own."""
+        frame = not self.body_joints(body) and not len(self.body_points(body))
+        return body, np.zeros(3) if frame else None
+
+    def _at_site(self, site: int) -> tuple[int, FloatArray]:
+        return int(self.model.site_bodyid[site]), self.model.site_pos[site].copy()
+
+    def _joints_to(self, body: int) -> list[int]:
+        return [joint for part in reversed(self.parents(body)) for joint in self.body_joints(part)]
+
+    def _fixed_to(self, body: int, link: int) -> bool:
+        for part in self.parents(body):
+            if part == link:
+                return True
+            if self.body_joints(part):
+                return False
+        return False
+
+    def place(self, joints: Sequence[int], values: FloatArray) -> None:
+        """Compute the kinematics at values of some joints [rad or m], the others as the model has them."""
+        self.data.qpos[:] = self.model.qpos0
+        self.data.qpos[self.model.jnt_qposadr[list(joints)]] = values
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def range_of(self, joint: int, unlimited: float) -> tuple[float, float]:
+        """Limits of a joint [rad or m]; for one without, plus and minus `unlimited`."""
+        if self.model.jnt_limited[joint]:
+            low, high = self.model.jnt_range[joint]
+            return float(low), float(high)
+        return -unlimited, unlimited
+
+    # ---- shapes ----------------------------------------------------------------------------------------------
+
+    def geom_points(self, geom: int) -> FloatArray:
+        """Points whose hull contains a geom, in its body's frame [m], (n, 3); none of a plane."""
+        model, size = self.model, self.model.geom_size[geom]
+        kind = model.geom_type[geom]
+        if kind == MESH:
+            mesh = int(model.geom_dataid[geom])
+            first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+            points = model.mesh_vert[first : first + count].astype(np.float64)
+        elif kind in (PLANE, FIELD):
+            return np.zeros((0, 3))
+        else:
+            points = _hull(kind, size)
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        return matmul(points, rotation.reshape(3, 3).T) + model.geom_pos[geom]
+
+    def body_geoms(self, body: int) -> list[int]:
+        """Geoms of a body."""
+        first, count = int(self.model.body_geomadr[body]), int(self.model.body_geomnum[body])
+        return list(range(first, first + count))
+
+    def body_points(self, body: int) -> FloatArray:
+        """Points around a body's shapes, in its frame [m], (n, 3)."""
+        return np.concatenate([np.zeros((0, 3)), *(self.geom_points(geom) for geom in self.body_geoms(body))])
+
+    def round_geoms(self, body: int) -> list[int]:
+        """Geoms of a body that are spheres or capsules and have a name."""
+        kinds = (SPHERE, CAPSULE)
+        return [g for g in self.body_geoms(body) if self.model.geom_type[g] in kinds and self.model.geom(g).name]
+
+    @cached_property
+    def shaft(self) -> dict[int, Capsule]:
+        """The longest straight thin part of each body that has one, by body."""
+        found: dict[int, Capsule] = {}
+        for body in range(1, self.model.nbody):
+            fitted = [fit_capsule(points) for g in self.body_geoms(body) if len(points := self.geom_points(g))]
+            thin = [one for one in fitted if is_shaft(one)]
+            if thin:
+                found[body] = max(thin, key=lambda one: one.length)
+        return found
+
+    # ---- remote centre ---------------------------------------------------------------------------------------
+
+    def remote_centre(self, chain: Sequence[int], tip: int, offset: FloatArray) -> RemoteCentre | None:
+        """The point where the axes of the first hinges meet in all poses and through which a slide moves the shaft."""
+        model = self.model
+        slides = [index for index, joint in enumerate(chain) if model.jnt_type[joint] == SLIDE]
+        if not slides or slides[0] < 2 or not model.jnt_limited[chain[slides[0]]]:
+            return None
+        before, slide = chain[: slides[0]], chain[slides[0]]
+        body = int(model.jnt_bodyid[slide])
+        rng, found = np.random.default_rng(0), []
+        for _ in range(3):
+            ranges = np.array([self.range_of(joint, np.pi) for joint in chain])
+            self.place(chain, ranges[:, 0] + rng.random(len(chain)) * np.ptp(ranges, axis=1))
+            point = meeting_point(self.data.xanchor[before], self.data.xaxis[before])
+            if point is None:
+                return None
+            body = self._shaft_body(chain, slides[0])
+            rotation = self.data.xmat[body].reshape(3, 3)
+            axis = matmul(rotation.T, self.data.xaxis[slide])
+            # The point of the line that is nearest to the body's origin, which the insertion does not move.
+            local = matmul(rotation.T, point - self.data.xpos[body])
+            found.append((point, local - matmul(local, axis) * axis, axis))
+        first = found[0]
+        if any(np.abs(np.array(one) - np.array(first)).max() > MEETING_TOLERANCE for one in found):
+            return None
+        point, local, axis = first
+        low, high = self.range_of(slide, 0.0)
+        reach = []
+        for value in (low, high):
+            self.place([slide], np.array([value]))
+            along = matmul(self.data.xmat[body].reshape(3, 3), axis)
+            tip_now = self.data.xpos[tip] + matmul(self.data.xmat[tip].reshape(3, 3), offset)
+            reach.append(float(matmul(tip_now - point, along)))
+        sign = np.sign(max(reach, key=abs))
+        return RemoteCentre(point, body, local, sign * axis, slide)
+
+    def _shaft_body(self, chain: Sequence[int], slide: int) -> int:
+        """The last body that only turns about the line along which a slide moves, as the data are posed."""
+        body = int(self.model.jnt_bodyid[chain[slide]])
+        axis = self.data.xaxis[chain[slide]]
+        line = self.data.xanchor[chain[slide + 1]] if slide + 1 < len(chain) else None
+        for joint in chain[slide + 1 :]:
+            turned = norm(np.cross(self.data.xaxis[joint], axis))
+            aside = norm(np.cross(self.data.xanchor[joint] - line, axis))
+            if self.model.jnt_type[joint] != HINGE or turned > 1e-6 or aside > MEETING_TOLERANCE:
+                break
+            body = int(self.model.jnt_bodyid[joint])
+        return body
+
+
+def meeting_point(points: FloatArray, axes: FloatArray) -> FloatArray | None:
+    """The point (3,) that lines with points and unit axes (n, 3) have in common; None if there is no single one."""
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    if eigh(total)[0][0] < 1e-3:
+        return None
+    point = solve(total, dot(across, points[:, None]).sum(axis=0))
+    missed = norm(dot(across, (point - points)[:, None]), axis=1).max()
+    return point if missed <= MEETING_TOLERANCE else None
+
+
+def fit_capsule(points: FloatArray) -> Capsule:
+    """A capsule along the longest principal axis of points (n, 3) that contains them."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    around = points - middle
+    axis = eigh(matmul(around.T, around))[1][:, -1]
+    height = matmul(around, axis)
+    beside = around - height[:, None] * axis
+    aside = 0.5 * (beside.min(axis=0) + beside.max(axis=0))
+    aside = aside - matmul(aside, axis) * axis
+    radius = max(float(norm(beside - aside, axis=1).max()), 1e-4)
+    centre = middle + aside
+    # The ends of the capsule are round: the cylinder's corners are inside up to the axis' ends.
+    low, high = float(height.min()), float(height.max())
+    if high - low <= 2.0 * radius:
+        centre = centre + 0.5 * (low + high) * axis
+        return Capsule(centre, centre, float(norm(points - centre, axis=1).max()))
+    return Capsule(centre + low * axis, centre + high * axis, radius)
+
+
+def is_shaft(capsule: Capsule) -> bool:
+    """Whether a capsule is long and thin enough for a laparoscopic instrument's shaft."""
+    return capsule.length >= SHAFT_LENGTH_LEAST and capsule.radius <= SHAFT_RADIUS_MOST
+
+
+def vector(values: FloatArray, digits: int | None = 9) -> Vector:
+    """Three numbers as a tuple, rounded to a number of decimals, without -0."""
+    x, y, z = (float(one) if digits is None else round(float(one), digits) + 0.0 for one in values)
+    return x, y, z
+
+
+def _has_tip_word(name: str) -> bool:
+    return any(word in name.lower() for word in TIP_WORDS)
+
+
+def _hull(kind: int, size: FloatArray) -> FloatArray:
+    """Points around a sphere, capsule, cylinder, ellipsoid or box in its own frame [m], (n, 3)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    ring = np.stack([cos(angle), sin(angle), np.zeros(16)], axis=1)
+    if kind == BOX or kind == ELLIPSOID:
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        return corners * size if kind == BOX else np.vstack([np.eye(3), -np.eye(3)]) * size
+    half = 0.0 if kind == SPHERE else float(size[1])
+    ends = [np.array([0.0, 0.0, end]) for end in (-half, half)]
+    caps = 0.0 if kind == CYLINDER else float(size[0])
+    tops = [np.array([[0.0, 0.0, end * (half + caps)]]) for end in (-1.0, 1.0)]
+    return np.concatenate([*(ring * size[0] + end for end in ends), *tops])

@@ -1,0 +1,157 @@
+"""`surgsim arm check`: a palpating arm made from an MJCF or URDF file, with its TOML file and a picture."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+from rich.console import Console
+
+from surgsim_apps.cli.values import MaybeNumber, MaybePath, MaybeText, vector_of
+from surgsim_apps.reports.output_folder import output_folder
+from surgsim_env.step_progress import StepProgress
+
+if TYPE_CHECKING:
+    from surgsim_env.instruments import Arm as ArmKinematics
+
+# Below this share of the places around home that the tip reaches, the arm is not useful as it is.
+REACH_LEAST = 0.5
+# Comments on the entries of the file that is written.
+COMMENTS = {
+    "model": "MJCF or URDF file, relative to this file",
+    "kind": '"palpator" or "grasper"',
+    "joints": "driven joints, base to tip",
+    "contact": "geoms that tissue feels: spheres and capsules",
+    "links": "outer shapes, for clearances only",
+    "dropped_meshes": "meshes of the URDF that are left out: put them beside it and take them out here",
+    "description": "one line",
+    "tip": "the controlled point",
+    "tip.body": "link that carries it",
+    "tip.offset": "[m] in that link's frame",
+    "tip.direction": "out of the tip, in that link's frame",
+    "tip.ball": "sphere whose radius a scene sets",
+    "trocar": "where the shaft passes through the body wall; a scene's port is put there",
+    "trocar.shaft_body": "link with the straight shaft",
+    "trocar.shaft_point": "[m] a point of the shaft's axis, in that link's frame",
+    "trocar.shaft_axis": "direction of the shaft to the tip, in that link's frame",
+    "trocar.point": "[m] in the model's own frame",
+    "trocar.into": "direction into the patient, in the model's own frame",
+    "trocar.fixed": "true: the mechanism keeps the shaft there (remote centre); false: control does",
+    "trocar.tolerance": "[m] largest distance of shaft and trocar",
+    "control": "one number a joint, in the order of joints",
+    "control.mode": '"position": the model\'s own position actuators; "servo": they are replaced by servos',
+    "control.speed_limit": "[rad/s, m/s]",
+    "control.stiffness": "[N m/rad, N/m] inertia at home times (2 pi 30 Hz)^2, and at least 5e4 N/m at the tip",
+    "control.damping": "[N m s/rad, N s/m] critical",
+    "control.effort": "[N m, N] largest torque or force",
+    "control.armature": "[kg m^2, kg] rotor inertia, of the model or chosen for that stiffness",
+    "home": "[rad, m] the tip 10 cm past the trocar",
+    "limits": "[rad, m] of joints for which the model states none",
+    "held": "[rad, m] joints that do not move the tip, fixed at these values",
+    "shapes": "sphere or capsule that the model lacks",
+    "shapes.body": "link that carries it",
+    "shapes.start": "[m] one end of the axis, or the middle of a ball, in the link's frame",
+    "shapes.end": "[m] the other end",
+    "shapes.radius": "[m]",
+    "inertias": "mass and inertia of a link in place of the URDF's, which are missing or not those of a body",
+    "inertias.mass": "[kg]",
+    "inertias.centre": "[m] centre of mass in the link's frame",
+    "inertias.moments": "[kg m^2] about the axes of that frame, of a solid block",
+}
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Make a palpating arm from an MJCF or URDF file: `surgsim arm check FILE`.
+
+    Finds the chain of joints, the tip, the shaft, a trocar and a home; finds meshes, replaces missing inertias, adds
+    shapes that tissue feels. Writes NAME.toml, with a comment on every entry, and NAME.png. See docs/arms.md.
+    """
+
+    action: tyro.conf.Positional[Literal["check"]]
+    """What to do."""
+    file: tyro.conf.Positional[Path]
+    """MJCF or URDF file of the arm."""
+    tip: MaybeText = None
+    """Link or site of the tip, or that carries the tool; default: the end of the longest chain of joints."""
+    trocar: MaybeText = None
+    """Trocar x,y,z in the model's own frame [m]; default: the remote centre, else chosen together with home."""
+    tool: MaybeNumber = None
+    """Mount a straight palpator of this length [m], whatever the model has; default: 0.4 on arms without a shaft."""
+    out: MaybePath = None
+    """Folder for the results; default: that of the file."""
+
+    def run(self, console: Console) -> int:
+        """Make the arm, print what was found and chosen, write its TOML file and a picture; 1 if it reaches little.
+
+        Raises:
+            ValueError: a file that is no arm, or an option that is not possible.
+        """
+        from surgsim_apps.arms.find_arm import find_arm
+        from surgsim_env.instruments import load_arm
+        from surgsim_env.scene import arm_toml, require_number
+
+        if self.file.suffix.lower() == ".xacro":
+            raise ValueError(f"{self.file} is a xacro file: expand it (xacro {self.file.name} > arm.urdf), check that")
+        if self.tool is not None:
+            require_number("--tool", self.tool, 0.05, "m")
+        folder, stem = self.out or self.file.parent, self.file.stem
+        names = f"{stem}.toml", f"{stem}.png"
+        if (folder / names[0]).exists():
+            raise ValueError(f"{folder / names[0]} is there already: remove it, or give another --out")
+        with StepProgress(console) as progress, progress.step("looking for a home"):
+            found = find_arm(
+                self.file,
+                tip=self.tip,
+                trocar=vector_of("--trocar", self.trocar),
+                tool_length=self.tool,
+            )
+        for sentence in found.found:
+            console.print(f"found: {sentence}", highlight=False, soft_wrap=True)
+        for sentence in found.chosen:
+            console.print(f"warning: {sentence}", highlight=False, soft_wrap=True, style="yellow")
+        model = os.path.relpath(self.file.resolve(), folder.resolve())
+        description = replace(found.description, model=Path(model).as_posix())
+        head = (
+            f"Written by `surgsim arm check` from {self.file.name}; docs/arms.md explains every entry.",
+            *(f"Found: {sentence}." for sentence in found.found),
+            *(f"Chosen: {sentence}." for sentence in found.chosen),
+        )
+        arm = load_arm(found.description)
+        with output_folder(folder, names) as files:
+            (files / names[0]).write_text(arm_toml(description, head=head, comments=COMMENTS), encoding="utf-8")
+            drawn = _draw(arm, files / names[1], console)
+        written = names if drawn else names[:1]
+        console.print(f"written: {folder}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
+        if found.reach < REACH_LEAST:
+            console.print(
+                f"the tip reaches {found.reach:.0%} of the places around home: name another --trocar or --tip",
+                highlight=False,
+                soft_wrap=True,
+            )
+            return 1
+        console.print(
+            f'try it: gymnasium.make("SurgSim/Palpate-v0", scene="phantom", instrument="{folder / names[0]}")',
+            highlight=False,
+            soft_wrap=True,
+        )
+        return 0
+
+
+def _draw(arm: ArmKinematics, path: Path, console: Console) -> bool:
+    """Write a picture of an arm at home; without OpenGL say why there is none."""
+    from matplotlib.image import imsave
+
+    from surgsim_apps.arms.arm_picture import draw_arm
+    from surgsim_env.rendering import NoGLError
+
+    try:
+        picture = draw_arm(arm, arm.home)
+    except NoGLError as error:
+        console.print(f"no picture: {error}", highlight=False, soft_wrap=True)
+        return False
+    imsave(path, picture, format="png")
+    return True

@@ -1,0 +1,135 @@
+"""`surgsim arms`: two arms evaluated on an organ, with a report."""
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from surgsim_apps.arms.ports import Ports, default_ports, read_ports
+from surgsim_apps.arms.study import RESULT_NAMES, ArmSetup, run_study
+from surgsim_apps.reports.output_folder import output_folder
+from surgsim_env.instruments import load_arm
+from surgsim_env.scene import (
+    Anatomy,
+    ArmDescription,
+    load_anatomy,
+    make_scene,
+    read_description,
+    read_toml,
+    with_motion,
+)
+
+FEWEST_POINTS = 10
+# A file of --compare with one of these tables is a ports file, any other an arm.
+PORT_TABLES = {"left", "right", "endoscope"}
+
+
+@dataclass(frozen=True)
+class Arms:
+    """Evaluate two arms on a patient's organ: reach of each and of both at once, clearances, forces, dexterity.
+
+    Writes report.html (self-contained), points.csv, heat maps and a picture (PNG). See docs/arms_report.md.
+    """
+
+    left: str
+    """The left arm: a shipped arm's name (psm_grasper, psm_retractor, ...) or a TOML file (docs/arms.md)."""
+    right: str
+    """The right arm, likewise."""
+    ports: Path | None = None
+    """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; default:
+    ports as in laparoscopy (docs/evaluation.md)."""
+    scene: str = "liver"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    compare: tuple[str, ...] = ()
+    """Other ports files, or arms for both sides, to be ranked in one table."""
+    points: int = 500
+    """Number of points of the organ to be tried."""
+    seed: int = 0
+    """Seed of the points."""
+    motion: str | None = None
+    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, paths and clearance
+    through the cycle to the report."""
+    out: Path = Path("runs/arms")
+    """Folder for the results."""
+
+    @property
+    def command_line(self) -> str:
+        """The command that makes the same report, without --out; files outside the working folder by name alone."""
+        words = ["surgsim", "arms", "--scene", _shown(self.scene), "--left", _shown(self.left)]
+        words += ["--right", _shown(self.right)]
+        if self.ports is not None:
+            words += ["--ports", _shown(self.ports)]
+        if self.compare:
+            words += ["--compare", *map(_shown, self.compare)]
+        counts = ["--points", self.points, "--seed", self.seed]
+        if self.motion is not None:
+            counts += ["--motion", self.motion]
+        return shlex.join([*words, *map(str, counts)])
+
+    def run(self, console: Console) -> int:
+        """Evaluate and write report.html, points.csv, the heat maps and a picture of the arms.
+
+        Raises:
+            ValueError: one line about an option that is not possible.
+        """
+        for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
+        anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
+        setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
+        with output_folder(self.out, RESULT_NAMES) as files:
+            written = run_study(
+                setups, anatomy, files, console, points=self.points, seed=self.seed, command=self.command_line
+            )
+        console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
+        return 0
+
+
+def _setup(command: Arms, anatomy: Anatomy, compared: str | None) -> ArmSetup:
+    """The arms at their ports as given, or with a file of --compare: at its ports, or its arm on both sides."""
+    given = "default ports" if command.ports is None else command.ports.name
+    left, right, ports = _read("--left", command.left), _read("--right", command.right), command.ports
+    if compared is None:
+        name, what = given, f"{left.name} left, {right.name} right, as given"
+    elif _is_ports_file(compared):
+        name, what = Path(compared).name, f"ports, with {left.name} left, {right.name} right"
+        ports = Path(compared)
+    else:
+        name, what = Path(compared).name, f"arm on both sides, at the ports of {given}"
+        left = right = _read("--compare", compared)
+    placed, radius = _checked_ports(ports, anatomy), anatomy.scene.instrument.tip_radius
+    # A model that is wrong is refused before the first evaluation, which takes a minute.
+    for description, place in ((left, placed.left), (right, placed.right)):
+        load_arm(description, place.port, tip_radius=radius)
+    return ArmSetup(name, what, left, right, placed)
+
+
+def _is_ports_file(source: str) -> bool:
+    return source.endswith(".toml") and bool(PORT_TABLES & read_toml(Path(source), "--compare").keys())
+
+
+def _read(option: str, source: str) -> ArmDescription:
+    try:
+        return read_description(source)
+    except ValueError as error:
+        raise ValueError(f"{option}: {error}") from None
+
+
+def _checked_ports(path: Path | None, anatomy: Anatomy) -> Ports:
+    if path is None:
+        return default_ports(anatomy)
+    ports = read_ports(path)
+    try:
+        ports.check_outside(anatomy)
+    except ValueError as error:
+        raise ValueError(f"ports file {path.name}: {error}") from None
+    return ports
+
+
+def _shown(source: str | Path) -> str:
+    """A path that does not depend on the machine: relative to the working folder, or its name alone."""
+    path = Path(source)
+    if not path.is_absolute():
+        return path.as_posix()
+    return path.relative_to(Path.cwd()).as_posix() if path.is_relative_to(Path.cwd()) else path.name

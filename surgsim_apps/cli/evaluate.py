@@ -1,0 +1,56 @@
+"""`surgsim evaluate`: score a method on fixed seeds, or compare two results."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+
+from surgsim_apps.cli.values import MaybePath, MaybeText, missing_packages
+from surgsim_apps.scoring.options import ScoringOptions
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score a method on fixed seeds: a search or a script by name, a trained policy, or an agent of your own.
+
+    Give one of --agent, --policy, --all and --compare. Results, the agents' interface and what makes
+    a score comparable: docs/own_agent.md. Reading a policy's files runs no code of its author.
+    """
+
+    agent: MaybeText = None
+    """MODULE:CLASS, or a name such as gp_ucb, raster_4, sobol, random, oracle (an unknown one lists all)."""
+    policy: MaybePath = None
+    """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
+    all: bool = False
+    """Every search, and every shipped policy for this scene."""
+    compare: tuple[Path, Path] | None = None
+    """Result files of two methods on the same episodes."""
+    played: ScoringOptions = field(default_factory=ScoringOptions)
+
+    def run(self, console: Console) -> int:
+        """Play, print and write; returns 0.
+
+        Raises:
+            ValueError: not one of the four, options that do not go with it, a missing package, an unknown method.
+        """
+        asked = [name for name in ("agent", "policy", "all", "compare") if getattr(self, name)]
+        if len(asked) != 1:
+            told = " and ".join(f"--{name}" for name in asked) or "none"
+            raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {told}")
+        options = self.played
+        if (options.env or options.env_kwargs) and ":" not in (self.agent or ""):
+            raise ValueError(
+                "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
+            )
+        from surgsim_apps.scoring import evaluate
+
+        with missing_packages("evaluate", "agents"):
+            if self.agent is not None:
+                evaluate.evaluate(evaluate.find_player(self.agent, options), options, console)
+            elif self.policy is not None:
+                evaluate.evaluate(evaluate.policy_player(Path(self.policy), options), options, console)
+            elif self.all:
+                evaluate.evaluate_all(options, console)
+            elif self.compare is not None:
+                evaluate.print_comparison(*self.compare, console)
+        return 0

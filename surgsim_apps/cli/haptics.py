@@ -1,0 +1,168 @@
+"""`surgsim haptics`: a device holds a scene's instrument in real time."""
+
+import csv
+import gc
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from surgsim_apps.cli.values import MaybeText
+from surgsim_apps.haptics.device import DeviceDynamics
+from surgsim_apps.haptics.loop import HapticLoop, HapticTelemetry
+from surgsim_apps.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
+from surgsim_apps.haptics.settings import BREATH_BIT, HapticSettings
+from surgsim_apps.haptics.trajectory import TrajectoryDevice
+from surgsim_apps.haptics.udp import PORT, UdpDevice
+from surgsim_apps.reports.output_folder import output_folder
+from surgsim_env.coupling import Simulation
+from surgsim_env.instruments import parked_place
+from surgsim_env.scene import list_motions, load_anatomy, make_scene, pair_names, with_motion
+
+TELEMETRY_NAME = "telemetry.csv"
+VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")
+NUMBERS = ("depth", "share", "energy")
+FLAGS = ("fresh", "clamped", "slewed", "approaching", "speed_limited", "workspace_limited")
+
+
+@dataclass(frozen=True)
+class Haptics:
+    """Let a haptic device hold the instrument in real time: a bridge on this machine over UDP, or a recorded file.
+
+    docs/haptics.md describes the packets. Ctrl-C ends it; it then prints rate, lateness and packet counts.
+    """
+
+    scene: str = "liver"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    motion: MaybeText = None
+    """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
+    apnoea: bool = False
+    """Hold the breath throughout; without it, the device's second button holds it while it is pressed."""
+    port: int = PORT
+    """UDP port on 127.0.0.1 to which the bridge sends its poses; 0 for a free one."""
+    trajectory: Path | None = None
+    """A CSV file with columns time [s], x, y, z [m], instead of a bridge."""
+    device_damping: float | None = None
+    """Damping of a device that pushes back [N s/m]; without it, the force is assumed to be displayed and not felt."""
+    device_mass: float = 0.05
+    """Mass of a device that pushes back, at its handle [kg]."""
+    device_delay: float = 0.0
+    """Delay of pose and force together [s]."""
+    seconds: float | None = None
+    """Duration [s]; default: until Ctrl-C, or the end of the trajectory."""
+    out: Path | None = None
+    """Folder for telemetry.csv: time, target, tip, forces, depth and active limits in each haptic step."""
+
+    def run(self, console: Console) -> int:
+        """Run the loop until its time is over, the trajectory ends, or Ctrl-C.
+
+        Raises:
+            ValueError: an unknown scene or motion, a bad trajectory, two arms, apnoea without breathing.
+            OSError: the port is taken, or a file cannot be read.
+        """
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
+            raise ValueError(f"--seconds is {self.seconds:g}; it must be finite and above 0")
+        scene = with_motion(make_scene(self.scene), self.motion)
+        if self.apnoea and not scene.has_breath:
+            breaths = " or ".join(list_motions()[1:])
+            raise ValueError(f"--apnoea: the patient of scene {scene.name!r} does not breathe; give --motion {breaths}")
+        if pair_names(scene.instrument.model) is not None:
+            raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
+        simulation = Simulation(load_anatomy(scene))
+        anatomy = simulation.anatomy
+        simulation.hold_breath(self.apnoea)
+        simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
+        with _device(self, simulation.haptic_dt) as device, _telemetry(self.out) as note:
+            settings = HapticSettings(relative=True, breath_button=None if self.apnoea else BREATH_BIT)
+            loop = HapticLoop(simulation, device, settings)
+            coupling = loop.held[0].coupling
+            console.print(f"scene {scene.name}: coupling {coupling.stiffness:.4g} N/m, {coupling.damping:.3g} N s/m")
+            if isinstance(device, UdpDevice):
+                host, port = device.address
+                console.print(f"poses to UDP {host}:{port}; Ctrl-C ends")
+            # Compiles, or loads compiled code, before the clock runs.
+            loop.step()
+            loop.reset(tip_position=parked_place(anatomy))
+            if isinstance(device, TrajectoryDevice):
+                device.rewind()
+            # Objects made so far stay alive, and a step makes no reference cycles: no garbage collection delays a step.
+            gc.collect()
+            gc.freeze()
+            timing = np.zeros((), dtype=TIMING)
+            begin = time.perf_counter()
+            pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
+            step, a_second = 0, round(1.0 / simulation.haptic_dt)
+            count = None if self.seconds is None else round(self.seconds / simulation.haptic_dt)
+            # Ctrl-C ends a run that has no end of its own.
+            with suppress(KeyboardInterrupt):
+                while count is None or step < count:
+                    pacer.wait()
+                    told = loop.step()
+                    note(told)
+                    step += 1
+                    if step % a_second == 0:
+                        tip = told.tip
+                        size = float((tip.contact_force @ tip.contact_force) ** 0.5)
+                        console.print(f"{told.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
+                    if told.fault:
+                        console.print(f"the organ diverged and is reset: {told.fault}")
+                        loop.reset(tip_position=parked_place(anatomy))
+                    pacer.done(simulation.haptic_dt)
+                    if count is None and isinstance(device, TrajectoryDevice) and device.over:
+                        break
+            kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
+            console.print(
+                f"{kept.rate:.1f} haptic steps a second; late by {kept.late_p50 * 1e3:.2f} ms (half), "
+                f"{kept.late_p99 * 1e3:.2f} ms (99 %), {kept.late_most * 1e3:.2f} ms (all); "
+                f"{kept.skipped} steps given up"
+            )
+            if isinstance(device, UdpDevice):
+                console.print(f"packets: {device.counts}")
+        return 0
+
+
+@contextmanager
+def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | TrajectoryDevice]:
+    """The device that the options choose, closed at the end."""
+    dynamics = _dynamics(command)
+    if command.trajectory is not None:
+        yield TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
+        return
+    with closing(UdpDevice(command.port, dynamics=dynamics)) as device:
+        yield device
+
+
+def _dynamics(command: Haptics) -> DeviceDynamics | None:
+    """Of a device that pushes back."""
+    if command.device_damping is None:
+        return None
+    if command.trajectory is not None:
+        raise ValueError("--device-damping: a --trajectory is no device that pushes back; give only one of both")
+    return DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
+
+
+@contextmanager
+def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
+    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing."""
+    if folder is None:
+        yield lambda told: None
+        return
+    with (
+        output_folder(folder, [TELEMETRY_NAME]) as files,
+        (files / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
+        yield lambda told: writer.writerow(_row(told))
+
+
+def _row(told: HapticTelemetry) -> list[float | int]:
+    tip = told.tip
+    vectors = [value for name in VECTORS for value in getattr(tip, name).tolist()]
+    numbers = [getattr(tip, name) for name in NUMBERS]
+    return [told.time, *vectors, *numbers, *(int(getattr(tip, name)) for name in FLAGS)]

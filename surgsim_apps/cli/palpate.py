@@ -1,0 +1,156 @@
+"""`surgsim palpate`: palpate a scene, and write the results."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from surgsim_apps.cli.values import (
+    MaybeNumber,
+    MaybePath,
+    MaybeText,
+    numbers_of,
+    vector_of,
+)
+from surgsim_apps.palpate.figures import write_stiffness_map
+from surgsim_apps.palpate.job import (
+    CSV_NAME,
+    MODEL_MODULUS_ERROR,
+    PICTURE_NAME,
+    SUMMARY_NAME,
+    plan_sites,
+    print_report,
+    run_palpation,
+    write_csv,
+    write_summary,
+)
+from surgsim_apps.palpate.scene_options import SceneOptions, load_stable_anatomy, with_options
+from surgsim_apps.reports.output_folder import output_folder
+from surgsim_env.scene import Anatomy, Ball, Vector, load_anatomy, load_scene, make_scene
+from surgsim_env.step_progress import StepProgress
+
+
+@dataclass(frozen=True)
+class Palpate:
+    """Press an organ site by site, map its stiffness, and report where lesions were felt.
+
+    Lengths are in metres, forces in newtons. Writes palpation.csv, stiffness_map.png and summary.json.
+    """
+
+    scene: MaybeText = None
+    """A shipped scene (see `surgsim scenes`); liver if --organ is not given."""
+    organ: MaybePath = None
+    """Your own scene file (TOML), instead of --scene."""
+    lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """x,y,z,radius,ratio: centre and radius [m], ratio of its modulus to the healthy one; repeatable; replaces the
+    scene's lesions."""
+    lesion_below: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """SITE,DEPTH,RADIUS,RATIO: a lesion below a site of the raster, by its number in palpation.csv; depth of its centre
+    and radius [m], ratio as in --lesion; repeatable, with or without --lesion."""
+    approach: MaybeText = None
+    """x,y,z: direction of the probe. Default: the scene's."""
+    around: MaybeText = None
+    """x,y,z,radius: press only the sites inside this ball [m]; default: the whole palpable face."""
+    press_depth: MaybeNumber = None
+    """Depth of a press [m]; default: the scene's."""
+    spacing: MaybeNumber = None
+    """Distance between sites [m]; default: the scene's."""
+    out: MaybePath = None
+    """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
+    seed: int = 0
+    """Seed of the sensor's noise and of the pre-operative model's errors."""
+
+    @property
+    def options(self) -> SceneOptions:
+        """Options that replace values of the scene."""
+        return SceneOptions(
+            approach=vector_of("--approach", self.approach),
+            press_depth=self.press_depth,
+            spacing=self.spacing,
+        )
+
+    def run(self, console: Console) -> int:
+        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the lesions found.
+
+        Raises:
+            ValueError: options that do not go together, impossible values, a scene file that cannot be read.
+        """
+        _check(self)
+        around, asked, below = _around(self), _asked_lesions(self), _asked_below(self)
+        scene = load_scene(self.organ) if self.organ else make_scene(self.scene or "liver")
+        scene = with_options(scene, self.options)
+        names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
+        default = Path("runs") / f"palpate-{scene.name}"
+        with output_folder(self.out or default, names, numbered=self.out is None) as files:
+            with StepProgress(console) as progress, progress.step("preparing the organ"):
+                anatomy = load_anatomy(scene)
+                lesions = anatomy.demonstration_lesions()
+                if asked or below:
+                    places = [*asked, *(_below_site(anatomy, *one) for one in below)]
+                    lesions = [anatomy.lesion_at(*one, f"lesion {n}") for n, one in enumerate(places, start=1)]
+                    for lesion in lesions:
+                        anatomy.check_inside(lesion)
+                anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+            found = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, console=console)
+            with StepProgress(console) as progress, progress.step("drawing the map"):
+                write_csv(found, files / CSV_NAME)
+                write_summary(found, files / SUMMARY_NAME, vars(self))
+                write_stiffness_map(found, files / PICTURE_NAME)
+        print_report(found, console)
+        console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
+        return 0
+
+
+def _check(command: Palpate) -> None:
+    if command.scene is not None and command.organ is not None:
+        raise ValueError("give only one of --scene and --organ")
+    if command.seed < 0:
+        raise ValueError(f"--seed is {command.seed}; it must be a whole number of at least 0")
+
+
+def _around(command: Palpate) -> Ball | None:
+    if command.around is None:
+        return None
+    x, y, z, radius = numbers_of("--around", command.around, "x,y,z,radius")
+    if not 0.0 < radius < float("inf"):
+        raise ValueError(f"--around {command.around}: the radius is {radius:g} m; it must be finite and above 0")
+    return Ball((x, y, z), radius)
+
+
+def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
+    """Centre [m], radius [m] and modulus ratio of each --lesion."""
+    asked = []
+    for text in command.lesion:
+        x, y, z, radius, ratio = numbers_of("--lesion", text, "x,y,z,radius,ratio")
+        if not ratio > 0.0:
+            raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
+        asked.append(((x, y, z), radius, ratio))
+    return asked
+
+
+def _asked_below(command: Palpate) -> list[tuple[int, float, float, float]]:
+    """Site, depth of the centre [m], radius [m] and modulus ratio of each --lesion-below."""
+    asked = []
+    for text in command.lesion_below:
+        site, depth, radius, ratio = numbers_of("--lesion-below", text, "SITE,DEPTH,RADIUS,RATIO")
+        if site != int(site) or site < 0:
+            raise ValueError(f"--lesion-below {text}: the site is {site:g}; it must be a site's number, from 0")
+        if not ratio > 0.0:
+            raise ValueError(f"--lesion-below {text}: the modulus ratio is {ratio:g}; it must be above 0")
+        if not depth > radius > 0.0:
+            raise ValueError(
+                f"--lesion-below {text}: the centre is {depth * 1e3:g} mm deep, the radius {radius * 1e3:g} mm; the "
+                "rule is depth > radius > 0, or it sticks out of the organ"
+            )
+        asked.append((int(site), depth, radius, ratio))
+    return asked
+
+
+def _below_site(anatomy: Anatomy, site: int, depth: float, radius: float, ratio: float) -> tuple[Vector, float, float]:
+    """Centre [m], radius [m] and modulus ratio of a lesion below a site."""
+    sites, normals, _ = plan_sites(anatomy)
+    if site >= len(sites):
+        raise ValueError(f"--lesion-below {site}: there are {len(sites)} sites, from 0 to {len(sites) - 1}")
+    x, y, z = (sites[site] - depth * normals[site]).tolist()
+    return (x, y, z), radius, ratio

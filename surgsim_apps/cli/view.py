@@ -1,0 +1,76 @@
+"""`surgsim view`: a scene live in a browser."""
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from surgsim_apps.cli.values import MaybeText, missing_packages
+from surgsim_env.scene import make_scene, with_instrument, with_motion
+
+# The scene that has ports for two arms, and the two that work there.
+BIMANUAL_SCENE, BIMANUAL_INSTRUMENT = "lobe", "psm_pair"
+
+
+@dataclass(frozen=True)
+class View:
+    """Serve a scene live to a browser: press the organ with mouse, keys or gamepad, a thousand steps a second.
+
+    Prints the address to open on this machine; other machines use an SSH tunnel. See docs/live.md.
+    """
+
+    scene: str | None = None
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: liver, lobe for two arms."""
+    instrument: str | None = None
+    """An arm or a TOML file (docs/arms.md); default: the scene's own."""
+    bimanual: bool = False
+    """Two arms: a jaw to lift, a ball to touch."""
+    motion: MaybeText = None
+    """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
+    port: int = 8080
+    """Port of 127.0.0.1 to listen on, or the next free one; 0 for any free one."""
+    out: Path = Path("runs/live")
+    """Folder for recordings."""
+    seconds: float | None = None
+    """Stop after this time [s]."""
+
+    def run(self, console: Console) -> int:
+        """Serve until interrupted, or for some seconds.
+
+        Raises:
+            ValueError: a scene, an instrument or an option that is invalid; viser is not installed.
+            LiveError: the physics died, or viser cannot be guarded.
+        """
+        with missing_packages("view", "live"):
+            import viser  # noqa: F401
+        from surgsim_apps.live.page import Page
+        from surgsim_apps.live.session import Session
+
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
+            raise ValueError(f"--seconds is {self.seconds}; it must be finite and above 0")
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"--port is {self.port}; it must be from 0 (any free one) to 65535")
+        name = self.scene or (BIMANUAL_SCENE if self.bimanual else "liver")
+        instrument = self.instrument or (BIMANUAL_INSTRUMENT if self.bimanual else None)
+        scene = with_motion(with_instrument(make_scene(name), instrument), self.motion)
+        console.print(f"{scene.name}: meshing, and compiling if that was not done before ...", highlight=False)
+        session = Session(scene)
+        page = None
+        try:
+            session.wait()
+            page = Page(session, port=self.port, out=self.out)
+            console.print(f"open {page.server.address}", highlight=False, soft_wrap=True)
+            end = math.inf if self.seconds is None else time.monotonic() + self.seconds
+            try:
+                page.run(lambda: time.monotonic() >= end)
+            finally:
+                # However it ends: Ctrl-C, or a physics that died.
+                if written := page.end_recording():
+                    console.print(written, highlight=False, soft_wrap=True)
+        finally:
+            if page is not None:
+                page.server.stop()
+            session.close()
+        return 0

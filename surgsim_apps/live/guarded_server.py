@@ -1,0 +1,143 @@
+"""A viser server on 127.0.0.1 that answers only requests with the token of this run."""
+
+import hmac
+import http
+import secrets
+from collections.abc import Awaitable, Callable
+from contextlib import redirect_stdout
+from importlib.resources import files
+from io import StringIO
+from typing import Any
+
+import viser
+from websockets import Headers
+from websockets.asyncio import server as websocket_server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from surgsim_apps.live.exchange_records import LiveError
+
+LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
+# Sockets of keyboards, gamepads and frame rates: `hand.js` opens them.
+HAND_PATH = "/hand"
+# In this order: the second sends the server what the first counts.
+SCRIPTS = ("drawing.js", "hand.js")
+
+HandServer = Callable[[ServerConnection], Awaitable[None]]
+Answer = Callable[[ServerConnection, Request], Response | None]
+
+
+class GuardedServer:
+    """A viser server that listens on 127.0.0.1 and checks Host, Origin and token of each request.
+
+    The check of Host stops DNS rebinding, the check of Origin stops sockets opened by pages of other sites, and the
+    token stops other accounts of the machine. The token is the first part of every path, of the page and of its
+    sockets: viser's page opens its socket below its own address. A cookie would also reach every other server on the
+    same host, as cookies do not distinguish ports.
+
+    viser has no parameter for the function that websockets calls with each request (`process_request`), so
+    `websockets.asyncio.server.serve`, which viser opens its port with, is replaced while viser starts. If a later viser
+    opens its port in another way, the constructor raises and nothing is served.
+
+    Fields:
+        viser: the server whose scene and panel are filled
+        token: of this run, random
+        address: what to open, token included
+    """
+
+    def __init__(self, port: int, serve_hand: HandServer) -> None:
+        """Listen.
+
+        Args:
+            port: the next free one is taken if it is in use; 0 takes any free one.
+            serve_hand: takes over the sockets of `hand.js`.
+
+        Raises:
+            LiveError: a version of viser that would answer requests without the checks.
+        """
+        self.token = secrets.token_urlsafe(32)
+        self._serve_hand = serve_hand
+        serve: Any = websocket_server.serve
+        calls = []
+
+        def guarded(handler: HandServer, *place: Any, process_request: Answer, **options: Any) -> Any:
+            calls.append(place)
+            return serve(self._dispatch(handler), *place, process_request=self._answer(process_request), **options)
+
+        websocket_server.serve = guarded  # type: ignore[assignment]
+        try:
+            # viser prints an address without the token; the caller prints ours.
+            with redirect_stdout(StringIO()):
+                self.viser = viser.ViserServer(host=LOOPBACK, port=port, label="surgsim", verbose=False)
+        finally:
+            websocket_server.serve = serve
+        if not calls:
+            self.viser.stop()
+            raise LiveError(
+                f"viser {viser.__version__} opens its port in a way that surgsim cannot guard: install viser>=1.1,<1.2"
+            )
+        self.address = f"http://{LOOPBACK}:{self.viser.get_port()}/{self.token}"
+
+    def stop(self) -> None:
+        """Close all sockets and the port."""
+        self.viser.stop()
+
+    def _dispatch(self, viser_handler: HandServer) -> HandServer:
+        async def handle(connection: ServerConnection) -> None:
+            assert connection.request is not None
+            is_hand = self._path_behind_token(connection.request) == HAND_PATH
+            await (self._serve_hand if is_hand else viser_handler)(connection)
+
+        return handle
+
+    def _answer(self, viser_answer: Answer) -> Answer:
+        """The response to a request: a refusal, viser's page with our scripts, or None to open a socket."""
+
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
+            refusal = self._refusal(connection.local_address[1], request)
+            if refusal is not None or "Upgrade" in request.headers:
+                return refusal
+            # Not compressed, so that the scripts can be inserted.
+            if "Accept-Encoding" in request.headers:
+                del request.headers["Accept-Encoding"]
+            request.path = self._path_behind_token(request) or ""
+            response = viser_answer(connection, request)
+            return _with_scripts(response) if response is not None and request.path == "/" else response
+
+        return answer
+
+    def _refusal(self, port: int, request: Request) -> Response | None:
+        """A response that refuses a request to a port with its reason, or None for an accepted one."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1 or hosts[0] not in [f"{name}:{port}" for name in NAMES]:
+            return _refuse(http.HTTPStatus.MISDIRECTED_REQUEST, "this server has another name (Host)")
+        # A browser sends the origin of the page with each socket that the page opens.
+        if origins != [f"http://{hosts[0]}"] and (origins or "Upgrade" in request.headers):
+            return _refuse(http.HTTPStatus.FORBIDDEN, "the request comes from another site's page (Origin)")
+        if self._path_behind_token(request) is None:
+            return _refuse(http.HTTPStatus.UNAUTHORIZED, "open the whole address that `surgsim view` printed (token)")
+        return None
+
+    def _path_behind_token(self, request: Request) -> str | None:
+        """The path of a request without its token and its query, "/" for the page; None without the token."""
+        first, _, rest = request.path.partition("?")[0].removeprefix("/").partition("/")
+        has_token = hmac.compare_digest(first.encode("utf-8", "surrogateescape"), self.token.encode())
+        return f"/{rest}" if has_token else None
+
+
+def _with_scripts(response: Response) -> Response:
+    """The page with our scripts, before its own."""
+    folder = files("surgsim_apps.live")
+    scripts = b"".join(b"<script>" + folder.joinpath(name).read_bytes() + b"</script>" for name in SCRIPTS)
+    body = response.body.replace(b"</head>", scripts + b"</head>", 1)
+    headers = Headers({"Content-Type": response.headers["Content-Type"], "Content-Length": str(len(body))})
+    return Response(response.status_code, response.reason_phrase, headers, body)
+
+
+def _refuse(status: http.HTTPStatus, reason: str) -> Response:
+    """A short response in plain text that closes the connection."""
+    body = f"surgsim: {reason}\n".encode()
+    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+    headers["Connection"] = "close"
+    return Response(int(status), status.phrase, headers, body)

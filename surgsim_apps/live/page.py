@@ -1,0 +1,278 @@
+"""The page: shows frames of the physics and passes requests of the panel to the session, thirty times a second."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from msdm_core.mesh import FloatArray
+from surgsim_apps.haptics.pacing import timeliness
+from surgsim_apps.live.exchange_records import Change, LiveError, Pause, Phase, Record, Reset
+from surgsim_apps.live.guarded_server import GuardedServer
+from surgsim_apps.live.messages import SOFTWARE, read_hand
+from surgsim_apps.live.organ_choice import chosen_lesions
+from surgsim_apps.live.panel import Panel, status_rows
+from surgsim_apps.live.recording import write_recording
+from surgsim_apps.live.session import Session
+from surgsim_apps.live.stage import SCALE, FeltMap, ForceArrow, InstrumentView, OrganView, Surroundings, add_handle
+
+# Between updates of the plots, and of the status text [s].
+PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
+# Longest wait for the physics to end a recording [s].
+END_TIMEOUT = 2.0
+# Time between pictures [s].
+PICTURE_PERIOD = 1.0 / 30.0
+
+
+class HandSockets:
+    """The sockets that `hand.js` opens, one per tab.
+
+    Fields:
+        software: whether a tab without a graphics card was opened
+    """
+
+    def __init__(self, session: Session) -> None:
+        """Push a session's hands."""
+        self._session = session
+        self.software = False
+
+    async def serve(self, connection: ServerConnection) -> None:
+        """Serve one tab until it is closed."""
+        with contextlib.suppress(ConnectionClosed, asyncio.CancelledError):
+            while True:
+                message = await connection.recv(decode=False)
+                if message == SOFTWARE:
+                    self.software = True
+                else:
+                    self._session.push(read_hand(message))
+
+
+class Page:
+    """A session on a guarded viser server.
+
+    Fields:
+        session, server: the physics' side and the browsers' side
+        felt: stiffness map of this organ from the touches so far
+        pictures: number of pictures sent
+    """
+
+    def __init__(self, session: Session, *, port: int, out: Path) -> None:
+        """Serve.
+
+        Args:
+            session: a running one.
+            port: see `GuardedServer`.
+            out: folder that recordings are written to.
+
+        Raises:
+            LiveError: see `GuardedServer`.
+        """
+        self.session, self._out = session, out
+        self._tabs = HandSockets(session)
+        self.server = GuardedServer(port, self._tabs.serve)
+        self.felt = FeltMap(session.anatomy)
+        self.pictures = 0
+        self._organ_number, self._traced = 1, 0
+        self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._held: set[int] = set()
+        self._shows_lesions = False
+        # Number of recordings written; the physics counts those begun.
+        self._recordings_written = 0
+        self._doing: tuple[int, bool] | None = None
+        self._said = ""
+        # None: neither a browser nor the user has chosen yet.
+        self._plain: bool | None = None
+        viser = self.server.viser
+        with viser.atomic():
+            self._surroundings = Surroundings(viser, session.anatomy)
+            session.directions = self._surroundings.directions
+            self._organ = OrganView(viser.scene, session.anatomy)
+            self._add_instrument()
+            self._panel = Panel(
+                viser.gui,
+                session.scene,
+                session.arm_count,
+                session.instrument.jaw is not None,
+                self._calls(),
+            )
+
+    def _add_instrument(self) -> None:
+        """The instrument, a handle at each hand, an arrow of force at each tip."""
+        session, scene = self.session, self.server.viser.scene
+        self._instrument = InstrumentView(scene, session.instrument.model, session.geoms, session.arm_count)
+        self._instrument.on_drag(self._dragged)
+        size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
+        self._handles = [
+            add_handle(scene, arm, place, size, session.directions, self._pulled)
+            for arm, place in enumerate(session.parked)
+        ]
+        self._arrows = [ForceArrow(scene, arm, size) for arm in range(session.arm_count)]
+
+    def _calls(self) -> dict[str, Callable[..., None]]:
+        """Callbacks of the panel; a click toggles the current state, which a button's label may lag behind."""
+        session = self.session
+        return {
+            "pause": lambda: session.ask(Pause(session.frame()["phase"] != Phase.PAUSED)),
+            "reset": self._reset,
+            "record": lambda: session.ask(Record(not session.frame()["recording"])),
+            "show_lesions": self._show_lesions,
+            "paint": self._organ.show_paint,
+            "clear_map": self.felt.clear,
+            "close_jaw": session.close_jaw,
+            "hold_breath": session.hold_breath,
+            "plain": self.show_plain,
+        }
+
+    def show_plain(self, on: bool) -> None:
+        """Turn shadows and reflections off or on, in every tab."""
+        self._plain = on
+        self._surroundings.show_plain(on)
+        self._panel.show_plain(on)
+
+    def run(self, until: Callable[[], bool]) -> None:
+        """Send pictures until `until()` holds.
+
+        Raises:
+            LiveError: the physics died.
+        """
+        due = time.monotonic()
+        self._before, self._pictures_before = self.session.timing(), 0
+        plot_due = status_due = due
+        while not until():
+            self.session.require_alive()
+            now = time.monotonic()
+            frame = self.session.frame()
+            self._attend(frame)
+            if self.server.viser.get_clients():
+                with self.server.viser.atomic():
+                    self._show(frame)
+                    if now >= plot_due:
+                        plot_due = now + PLOT_PERIOD
+                        self._panel.plot(self.session.trace())
+                self.pictures += 1
+            if now >= status_due:
+                status_due = now + STATUS_PERIOD
+                self._say(frame)
+            due = max(due + PICTURE_PERIOD, time.monotonic() - PICTURE_PERIOD)
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def end_recording(self) -> str:
+        """Write the current recording to a file; returns a sentence that states the result, or "".
+
+        Call it after `run` has ended, also by an error: the recorded steps lie in shared memory, which outlives the
+        physics' process.
+        """
+        session = self.session
+        begun = int(session.exchange.frame.peek["recordings"])
+        if begun == self._recordings_written:
+            return ""
+        session.ask(Record(False))
+        with contextlib.suppress(LiveError):
+            deadline = time.monotonic() + END_TIMEOUT
+            while session.alive and session.frame()["recording"] and time.monotonic() < deadline:
+                time.sleep(0.005)
+        self._recordings_written = begun
+        return f"{self._out}: {write_recording(session.exchange.recorded.steps.copy(), self._out)}"
+
+    def _pulled(self, arm: int, phase: str, place: FloatArray) -> None:
+        """The handle of a hand is dragged to a position [m], (3,)."""
+        if phase == "start":
+            self._held.add(arm)
+        self.session.move_to(arm, place)
+        if phase == "end":
+            self._held.discard(arm)
+
+    def _dragged(self, arm: int, phase: str, pointer: FloatArray) -> None:
+        """The instrument itself is dragged across the view."""
+        if phase == "start" or arm not in self._grabs:
+            self._grabs[arm] = (self.session.targets[arm], pointer)
+        start, grabbed = self._grabs[arm]
+        self.session.move_to(arm, start + pointer - grabbed)
+        if phase == "end":
+            del self._grabs[arm]
+
+    def _reset(self) -> None:
+        self.session.park()
+        self.session.ask(Reset())
+
+    def _show_lesions(self, on: bool) -> None:
+        self._shows_lesions = on
+        with self.server.viser.atomic():
+            self._organ.show_lesions(chosen_lesions(self.session.anatomy, self.session.choice) if on else [])
+
+    def _attend(self, frame: np.ndarray) -> None:
+        """Do what does not depend on open tabs: update the stiffness map, apply the sliders, write recordings."""
+        session = self.session
+        if self._plain is None and self._tabs.software:
+            self.show_plain(True)
+        choice = self._panel.settled_choice()
+        if choice is not None and choice != session.choice:
+            session.park()
+            session.ask(Change(choice))
+        if int(frame["organ"]) != self._organ_number:
+            self._organ_number = int(frame["organ"])
+            self.felt.clear()
+            if self._shows_lesions:
+                self._show_lesions(True)
+        self._feel()
+        recording, begun = bool(frame["recording"]), int(frame["recordings"])
+        if begun > self._recordings_written and not recording:
+            self._recordings_written = begun
+            self._said = write_recording(session.exchange.recorded.steps.copy(), self._out)
+        doing = (int(frame["phase"]), recording)
+        if doing != self._doing:
+            self._doing = doing
+            self._show_phase(frame)
+
+    def _feel(self) -> None:
+        """Add the new rows of the trace to the stiffness map."""
+        trace = self.session.exchange.trace.read()
+        count = int(trace["count"])
+        self._traced = min(self._traced, count)
+        rows = trace["row"]
+        for index in range(max(self._traced, count - len(rows)), count):
+            row = rows[index % len(rows)]
+            for arm in range(self.session.arm_count):
+                self.felt.feel(row["tip"][arm], float(row["depth"][arm]), float(np.linalg.norm(row["force"][arm])))
+        self._traced = count
+
+    def _show(self, frame: np.ndarray) -> None:
+        """Update the picture."""
+        self._organ.paint(self.felt)
+        self._organ.follow(frame["node"].astype(np.float64))
+        self._instrument.follow(frame["geom"], frame["turn"])
+        for arrow, tip, force in zip(self._arrows, frame["tip"], frame["force"], strict=True):
+            arrow.follow(tip, force)
+        targets = self.session.targets
+        for arm, handle in enumerate(self._handles):
+            if arm not in self._held and np.abs(handle.position / SCALE - targets[arm]).max() > 1e-6:
+                handle.position = targets[arm] * SCALE
+
+    def _say(self, frame: np.ndarray) -> None:
+        """Update the status text."""
+        now, pictures = self.session.timing(), self.pictures
+        wall = now[1] - self._before[1]
+        kept = timeliness(self._before[0], now[0], wall)
+        fps = (pictures - self._pictures_before) / wall
+        self._before, self._pictures_before = now, pictures
+        rows = status_rows(
+            frame,
+            kept,
+            skipped=int(now[0]["skipped"]),
+            fps=fps,
+            said=self._said,
+            has_breath=self.session.scene.has_breath,
+        )
+        self._panel.show_status(frame, rows)
+        self._show_phase(frame)
+
+    def _show_phase(self, frame: np.ndarray) -> None:
+        recorded = self.session.exchange.recorded.count * self.session.scene.timing.haptic_step
+        self._panel.show_phase(
+            frame, recorded, jaw_closed=self.session.jaw_closed, breath_held=self.session.breath_held
+        )

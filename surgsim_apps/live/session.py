@@ -1,0 +1,240 @@
+"""A live session, seen from the page's process: moves the hands, sends requests, reads the physics' frames."""
+
+import contextlib
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh import FloatArray
+from surgsim_apps.haptics.pacing import PaceSettings
+from surgsim_apps.haptics.settings import BREATH_BIT
+from surgsim_apps.live.exchange_records import (
+    TRACE_LENGTH,
+    Change,
+    End,
+    Exchange,
+    LiveError,
+    Phase,
+    Request,
+    new_exchange,
+)
+from surgsim_apps.live.messages import HandMotion
+from surgsim_apps.live.organ_choice import OrganChoice, lesion_kinds, live_scene
+from surgsim_apps.live.physics import home_of, run_physics
+from surgsim_env.coupling import Simulation
+from surgsim_env.rendering import shown_geoms
+from surgsim_env.scene import Scene, load_anatomy
+
+# Updates of the hands [1/s], and how long a key or stick counts as held after its last message [s].
+BEAT_RATE, HELD = 100.0, 0.15
+# Speed of a target at full deflection [m/s].
+HAND_SPEED = 0.04
+# The button that closes a jaw, as `HapticSettings.jaw_button` has it, and the first arm's that holds the breath.
+JAW_BUTTON, BREATH_BUTTON = 1, 1 << BREATH_BIT
+# Longest start, with an empty numba cache [s].
+START_TIMEOUT = 300.0
+
+
+class Session:
+    """Starts the physics' process and communicates with it; every method may be called from any thread.
+
+    Fields:
+        anatomy, instrument: copies of the physics' ones; the instrument stays parked
+        exchange: memory shared with the physics
+        parked: initial positions of the tips [m]                                 (n_arm, 3)
+        choice: the organ requested last
+        directions: unit vectors right, away and out of the view, as rows         (3, 3)
+    """
+
+    def __init__(
+        self, scene: Scene, *, pace: PaceSettings | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Start the process; `wait` returns when it steps.
+
+        Args:
+            scene: the scene that is shown.
+            pace: of the haptic steps; one a haptic step of the scene by default.
+            clock: measures how long keys and sticks are held [s].
+
+        Raises:
+            ValueError: a scene whose mesh or instrument cannot be made.
+        """
+        self.scene = live_scene(scene)
+        self.anatomy = load_anatomy(self.scene)
+        self.instrument = Simulation(self.anatomy).instrument
+        self.parked = np.atleast_2d(home_of(self.anatomy, self.instrument)).copy()
+        self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
+        self.directions = np.eye(3)
+        self.geoms = shown_geoms(self.instrument.model)
+        self.exchange: Exchange = new_exchange(len(self.parked), self.anatomy.mesh.node_count, len(self.geoms))
+        self._targets = self.parked.copy()
+        self._buttons = np.zeros(len(self.parked), dtype=np.int64)
+        self._motions: dict[int, tuple[FloatArray, float]] = {}
+        self._clock = clock
+        self._lock = threading.Lock()
+        spawn = multiprocessing.get_context("spawn")
+        self._pipe, child = spawn.Pipe()
+        pace = pace or PaceSettings(period=self.scene.timing.haptic_step)
+        self._process = spawn.Process(
+            target=run_physics,
+            args=(self.scene, self.choice, pace, self.exchange, child, os.getpid()),
+            name="surgsim physics",
+            daemon=True,
+        )
+        self._process.start()
+        child.close()
+        self._ended = threading.Event()
+        self._beating = threading.Thread(target=self._beat, name="surgsim hands", daemon=True)
+        self._beating.start()
+
+    @property
+    def arm_count(self) -> int:
+        """Number of tips."""
+        return len(self.parked)
+
+    @property
+    def targets(self) -> FloatArray:
+        """Target positions of the hands [m], (n_arm, 3)."""
+        with self._lock:
+            return self._targets.copy()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the physics' process is running."""
+        return self._process.is_alive()
+
+    def wait(self, timeout: float = START_TIMEOUT) -> None:
+        """Wait until the physics steps.
+
+        Raises:
+            LiveError: the process ended (with its reason, where it sent one) or did not start in time.
+        """
+        deadline = time.monotonic() + timeout
+        while self.frame()["phase"] == Phase.STARTING or not int(self.exchange.timing.peek["steps"]):
+            self.require_alive()
+            if time.monotonic() > deadline:
+                raise LiveError(f"the physics did not begin within {timeout:g} s")
+            time.sleep(0.02)
+
+    def require_alive(self) -> None:
+        """Check that the physics' process is running.
+
+        Raises:
+            LiveError: it ended; with its reason, where it sent one.
+        """
+        if self.alive:
+            return
+        said = ""
+        # Other errors were printed by Python.
+        with contextlib.suppress(EOFError, OSError):
+            said = self._pipe.recv() if self._pipe.poll() else ""
+        why = said or f"exit code {self._process.exitcode}; its own message, if any, stands above"
+        raise LiveError(f"the physics' process died: {why}")
+
+    def frame(self) -> NDArray[Any]:
+        """The newest frame, a copy."""
+        return self.exchange.frame.read()
+
+    def trace(self) -> NDArray[Any]:
+        """The trace's rows, oldest first."""
+        trace = self.exchange.trace.read()
+        count = int(trace["count"])
+        if count <= TRACE_LENGTH:
+            return trace["row"][:count]
+        return np.roll(trace["row"], -(count % TRACE_LENGTH), axis=0)
+
+    def timing(self) -> tuple[NDArray[Any], float]:
+        """A copy of the timing record and the clock's reading [s]."""
+        return self.exchange.timing.peek.copy(), time.perf_counter()
+
+    def ask(self, request: Request) -> None:
+        """Send a request; its effect appears in later frames."""
+        with self._lock:
+            if isinstance(request, Change):
+                self.choice = request.choice
+            # Where the physics is gone, `alive` says so.
+            with contextlib.suppress(OSError):
+                self._pipe.send(request)
+
+    def move_to(self, arm: int, target: FloatArray) -> None:
+        """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm."""
+        with self._lock:
+            self._targets[arm] = np.clip(target, self.instrument.lower - 0.01, self.instrument.upper + 0.01)
+
+    def park(self) -> None:
+        """Set all targets to the parked positions."""
+        with self._lock:
+            self._targets[:] = self.parked
+
+    def push(self, motion: HandMotion) -> None:
+        """Move a hand by a key or a stick, until its messages stop.
+
+        A page does not know the number of arms: with one arm, arm 1 is arm 0.
+        """
+        arm = motion.arm % self.arm_count
+        with self._lock:
+            self._motions[arm] = (np.array(motion.axes), self._clock())
+            if motion.turns_jaw:
+                self._buttons[arm] ^= JAW_BUTTON
+
+    def close_jaw(self, closed: bool) -> None:
+        """Close or open the first arm's jaw."""
+        self._press(JAW_BUTTON, closed)
+
+    @property
+    def jaw_closed(self) -> bool:
+        """Whether the first arm's jaw is commanded to close."""
+        return bool(self._buttons[0] & JAW_BUTTON)
+
+    def hold_breath(self, held: bool) -> None:
+        """Hold the patient's breath, or let it go on; it is recorded with the hand's buttons."""
+        self._press(BREATH_BUTTON, held)
+
+    @property
+    def breath_held(self) -> bool:
+        """Whether the page holds the breath."""
+        return bool(self._buttons[0] & BREATH_BUTTON)
+
+    def close(self) -> None:
+        """End the physics' process."""
+        self.ask(End())
+        self._ended.set()
+        self._beating.join(timeout=1.0)
+        with self._lock:
+            self._show_hands()
+        self._process.join(timeout=3.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join(timeout=3.0)
+        self._pipe.close()
+
+    def _beat(self) -> None:
+        """Move the hands that are pushed, and signal to the physics that this process is alive."""
+        period, then = 1.0 / BEAT_RATE, self._clock()
+        while not self._ended.wait(period):
+            now = self._clock()
+            passed, then = min(now - then, 0.1), now
+            with self._lock:
+                for arm, (axes, heard) in list(self._motions.items()):
+                    if now - heard > HELD or not axes.any():
+                        del self._motions[arm]
+                        continue
+                    moved = self._targets[arm] + passed * HAND_SPEED * (axes @ self.directions)
+                    self._targets[arm] = np.clip(moved, self.instrument.lower, self.instrument.upper)
+                self._show_hands()
+
+    def _press(self, button: int, pressed: bool) -> None:
+        """Press a button of the first arm's hand, or let it go."""
+        with self._lock:
+            self._buttons[0] = self._buttons[0] | button if pressed else self._buttons[0] & ~button
+
+    def _show_hands(self) -> None:
+        with self.exchange.hand.writing() as hand:
+            hand["target"], hand["buttons"] = self._targets, self._buttons
+            hand["beat"] += 1

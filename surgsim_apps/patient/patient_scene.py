@@ -1,0 +1,258 @@
+"""The palpation scene of a patient's organ: tip, press, limits and hidden lesions scaled to its cells and tissue."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from msdm_core.material import Material
+from surgsim_apps.palpate.hold import Hold
+from surgsim_apps.palpate.job import MODEL_MODULUS_ERROR, plan_sites
+from surgsim_apps.palpate.scene_options import (
+    CONTACT_MODULI_PER_CELL,
+    PATTERN,
+    SceneOptions,
+    with_options,
+)
+from surgsim_apps.patient.facing import faced_note, facing_approach
+from surgsim_apps.patient.fine_surface import mesh_source
+from surgsim_apps.patient.lesion_room import lack_of_room, sample_face
+from surgsim_apps.patient.materials import TissueMaterial, organ_material, region_material, without_number
+from surgsim_apps.patient.meshers import PatientMesh
+from surgsim_apps.patient.supports import organ_anchors
+from surgsim_apps.patient.touch import DEPTH_STEP, TouchPlan
+from surgsim_env.scene import (
+    Anatomy,
+    LesionDraw,
+    Limits,
+    PalpationSettings,
+    Scene,
+    TissueRegion,
+    Vector,
+    anatomy_of,
+    hertz_force,
+    make_scene,
+    with_substeps,
+)
+
+# As in the scene liver.
+SPACING_PER_TIP = 13.0 / 12.0
+SPACING_STEP = 5e-4
+# From the front and above in a scan's axes; against the third axis of files whose axes have no stated meaning.
+APPROACH_SCAN: Vector = (0.0, math.sqrt(0.5), -math.sqrt(0.5))
+APPROACH_FILE: Vector = (0.0, 0.0, -1.0)
+# Where the head is, likewise; in files across the usual approach.
+CRANIAL_SCAN: Vector = (0.0, 0.0, 1.0)
+CRANIAL_FILE: Vector = (1.0, 0.0, 0.0)
+# A raster of more sites takes minutes: its spacing is then enlarged.
+SITES_MOST = 60
+# Least thickness of organ below a site, in press depths; the first that leaves any site is taken.
+THICKNESSES = (5.0, 3.0, 0.0)
+# Force limits over the force of a healthy press (Hertz), as in the scene liver.
+SOFT_PER_PRESS, HARD_PER_PRESS = 2.0, 4.0
+# Ranges of hidden lesions in tip radii, as in the scene liver, and factors on them for organs without enough room.
+LESION_RADIUS, LESION_COVER, LESION_RIM = (1.5, 2.1), (0.25, 0.65), 2.1
+LESION_RATIO = (5.0, 8.0)
+LESION_SHRINKS = (1.0, 0.75, 0.55)
+
+
+@dataclass(frozen=True, eq=False)
+class PatientScene:
+    """A patient's organ with its palpation scene.
+
+    Fields:
+        patient: the mesh and its sources
+        anatomy: the scene on that mesh, as it will be read from the file
+        organ, regions: materials with their sources, of the healthy tissue and of each region by name
+        site_count: number of sites of its raster
+        notes: remarks on choices that differ from the usual
+        anchor_sources: where numbers of the anchors come from, by the path of their entry in the scene
+        hold: how healthy presses are borne, where it was checked
+    """
+
+    patient: PatientMesh
+    anatomy: Anatomy
+    organ: TissueMaterial
+    regions: Mapping[str, TissueMaterial]
+    site_count: int
+    notes: tuple[str, ...]
+    anchor_sources: Mapping[str, str]
+    hold: Hold | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.anatomy.scene
+
+
+def approach_of(options: SceneOptions, *, is_scan: bool) -> Vector:
+    """Direction of the probe: the one given, or the default for axes of a patient or of a file."""
+    return options.approach or (APPROACH_SCAN if is_scan else APPROACH_FILE)
+
+
+def patient_scene(
+    patient: PatientMesh, out: Path, *, touch: TouchPlan, options: SceneOptions, moduli: Mapping[str, float]
+) -> PatientScene:
+    """Make the palpation scene of a patient's organ.
+
+    Args:
+        patient: the organ.
+        out: path of the mesh file, beside which the scene file is; its stem names the scene.
+        touch: tip and press depth.
+        options: approach and healthy tissue.
+        moduli: of regions by name [Pa].
+
+    Raises:
+        ValueError: a modulus for a region that does not exist, a value out of range, no site to press.
+    """
+    organ = organ_material(patient.organ_name, options.youngs_modulus)
+    regions = {
+        one.name: region_material(one.name, patient.organ_name, organ.material, moduli) for one in patient.volumes[1:]
+    }
+    _check_moduli(moduli, list(regions))
+    scene = _first_scene(patient, out, organ.material, regions, touch, options)
+    anchors, sources = organ_anchors(
+        patient.organ_name, patient.mesh, scene.instrument.approach, is_scan=patient.is_scan
+    )
+    scene = replace(scene, anchors=anchors)
+    notes = faced_note(patient, scene)
+    anatomy, sites = _with_sites(scene, patient, notes)
+    anatomy = _with_lesions(anatomy, notes)
+    return PatientScene(patient, _substeps_of_worst(anatomy), organ, regions, sites, tuple(notes), sources)
+
+
+def _check_moduli(moduli: Mapping[str, float], names: Sequence[str]) -> None:
+    for name in moduli:
+        if not any(name in (one, without_number(one)) for one in names):
+            raise ValueError(f"--modulus {name}=...: there is no such region; there are {', '.join(names) or 'none'}")
+
+
+def _first_scene(
+    patient: PatientMesh,
+    out: Path,
+    material: Material,
+    regions: Mapping[str, TissueMaterial],
+    touch: TouchPlan,
+    options: SceneOptions,
+) -> Scene:
+    """The scene with all values that follow from the touch, the cells and the tissue."""
+    liver, cell = make_scene(PATTERN), patient.cell_size
+    tip, depth = touch.tip_radius, touch.press_depth
+    usual = approach_of(options, is_scan=patient.is_scan)
+    approach = options.approach or facing_approach(patient, usual, liver.palpation.face_angle_deg)
+    described = f"{patient.organ_name} of {', '.join(patient.sources)}, {patient.mesh.volumes.sum() * 1e6:.0f} ml"
+    if patient.lesions:
+        described += f", {len(patient.lesions)} segmented lesion(s)"
+    scene = replace(
+        liver,
+        name=out.stem,
+        description=described,
+        folder=out.parent,
+        mesh=mesh_source(out, patient.surface),
+        material=material,
+        contact=replace(liver.contact, stiffness=_digits(CONTACT_MODULI_PER_CELL * material.youngs_modulus / cell, 3)),
+        limits=_limits(material, tip, depth),
+        palpation=PalpationSettings(
+            press_depth=depth,
+            face_angle_deg=liver.palpation.face_angle_deg,
+            face_margin=tip,
+            site_spacing=_rounded(SPACING_PER_TIP * tip, SPACING_STEP),
+        ),
+        lesion=None,
+        demonstration=(),
+        regions=tuple(TissueRegion(one, what.material, one in patient.lesions) for one, what in regions.items()),
+        cranial=CRANIAL_SCAN if patient.is_scan else CRANIAL_FILE,
+    )
+    # Normalises the approach, and refuses values out of range.
+    scene = with_options(scene, replace(options, approach=approach, tip_radius=tip, press_depth=depth))
+    x, y, z = (round(part, 6) + 0.0 for part in scene.instrument.approach)
+    direction = (x, y, z)
+    return replace(scene, instrument=replace(scene.instrument, approach=direction))
+
+
+def _limits(material: Material, tip: float, depth: float) -> Limits:
+    """Twice and four times a healthy press."""
+    press = hertz_force(material, tip, depth)
+    return Limits(_digits(SOFT_PER_PRESS * press, 2), _digits(HARD_PER_PRESS * press, 2))
+
+
+def _with_sites(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple[Anatomy, int]:
+    """The anatomy with a raster of 1 to SITES_MOST sites, and their number."""
+    anatomy, count = _thick_enough(scene, patient, notes)
+    while count > SITES_MOST:
+        palpation = anatomy.scene.palpation
+        factor = max(math.sqrt(count / SITES_MOST), 1.02)
+        wider = math.ceil(palpation.site_spacing * factor / SPACING_STEP) * SPACING_STEP
+        palpation = replace(palpation, site_spacing=_rounded(wider, SPACING_STEP))
+        anatomy = anatomy_of(replace(scene, palpation=palpation), patient.mesh)
+        count = len(plan_sites(anatomy)[0])
+    return anatomy, count
+
+
+def _thick_enough(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple[Anatomy, int]:
+    """The anatomy with the first of THICKNESSES that leaves sites to press, and their number."""
+    palpation = scene.palpation
+    for thickness in THICKNESSES:
+        thick = replace(palpation, thickness_smallest=_rounded(thickness * palpation.press_depth, DEPTH_STEP))
+        anatomy = anatomy_of(replace(scene, palpation=thick), patient.mesh)
+        try:
+            count = len(plan_sites(anatomy)[0])
+        except ValueError:
+            if thickness == THICKNESSES[-1]:
+                raise
+            continue
+        if thickness != THICKNESSES[0]:
+            notes.append(f"the organ is thin: sites with {thickness:g} instead of 5 press depths of organ are pressed")
+        return anatomy, count
+    raise AssertionError("THICKNESSES is empty")
+
+
+def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
+    """The anatomy with ranges of hidden lesions that fit into it; without a lesion table if none fit."""
+    tip, lack = anatomy.scene.instrument.tip_radius, ""
+    sample = sample_face(anatomy)
+    for shrink in LESION_SHRINKS:
+        draw = LesionDraw(
+            radius=_pair(LESION_RADIUS, shrink * tip),
+            cover=_pair(LESION_COVER, shrink * tip),
+            modulus_ratio=LESION_RATIO,
+            rim_distance=_rounded(LESION_RIM * shrink * tip, DEPTH_STEP),
+        )
+        why = lack_of_room(sample, draw)
+        if not why:
+            if lack:
+                notes.append(f"hidden lesions are {shrink:g} times the size that suits the tip, since {lack}")
+            return replace(anatomy, scene=replace(anatomy.scene, lesion=draw))
+        lack = why
+    notes.append(
+        f"no hidden lesions: there is no [lesion] table, and environments of palpation refuse the organ, since {lack}"
+    )
+    return anatomy
+
+
+def _substeps_of_worst(anatomy: Anatomy) -> Anatomy:
+    """The anatomy with the substeps of its stiffest organ: with segmented lesions, a stiffer model, hidden lesions."""
+    scene = anatomy.scene
+    organs = [anatomy.organ(anatomy.demonstration_lesions()), anatomy.organ(modulus_factor=1.0 + MODEL_MODULUS_ERROR)]
+    if scene.lesion is not None:
+        draw, worst = scene.lesion, np.random.default_rng(0)
+        hardest = replace(
+            draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[0],) * 2, modulus_ratio=(draw.modulus_ratio[1],) * 2
+        )
+        organs += [anatomy.organ([anatomy.random_lesion(worst, hardest)]) for _ in range(2)]
+    return with_substeps(anatomy, organs)
+
+
+def _pair(share: tuple[float, float], length: float) -> tuple[float, float]:
+    return _rounded(share[0] * length, DEPTH_STEP), _rounded(share[1] * length, DEPTH_STEP)
+
+
+def _rounded(value: float, step: float) -> float:
+    """Rounded to a multiple of a step [m]."""
+    return round(round(value / step) * step, 7)
+
+
+def _digits(value: float, count: int) -> float:
+    return float(f"{value:.{count}g}")

@@ -1,0 +1,282 @@
+"""report.html of a patient's organ: source, mesh, tissue, palpation, scene, and pictures drawn without OpenGL."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msdm_core.arithmetic import matmul
+from msdm_core.material import Lesion, lesion_extent
+from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality
+from msdm_core.organ import compile_organ, stable_dt
+from surgsim_apps.patient.meshers import DIHEDRAL_SMALLEST
+from surgsim_apps.patient.patient_scene import PatientScene
+from surgsim_apps.patient.retract_scene import RetractScene, told
+from surgsim_apps.patient.supports import held_text
+from surgsim_apps.reports.html_page import Picture, render_page
+from surgsim_apps.reports.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
+from surgsim_env.rendering import cut_edges
+from surgsim_env.scene import hertz_force, hidden_text, share_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+GENERATOR = "surgsim organ"
+VOLUME_ERROR_LARGEST = 0.02
+
+# Cells of a table, the first of which names the row.
+Rows = list[tuple[str, ...]]
+TISSUE = np.array([0.72, 0.36, 0.30])
+PALPABLE = np.array([0.86, 0.56, 0.45])
+HELD = np.array([0.42, 0.47, 0.56])
+SECTION = np.array([0.90, 0.70, 0.62])
+# Colours of the regions after the first, repeated cyclically.
+REGIONS = np.array([[0.95, 0.78, 0.18], [0.25, 0.55, 0.85], [0.35, 0.70, 0.45], [0.62, 0.42, 0.75], [0.92, 0.50, 0.20]])
+# Views: direction, upward direction, and titles for the axes of a scan and for other axes.
+SIDES = (
+    ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), "from the front", "along y"),
+    ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), "from the patient's left", "against x"),
+    ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), "from the head", "against z"),
+)
+
+
+def report_page(
+    found: PatientScene, scene_text: str, scene_file: str, command: str, retraction: RetractScene | str | None = None
+) -> str:
+    """The page's text.
+
+    Args:
+        found: the organ with its scene.
+        scene_text: the scene as it is written.
+        scene_file: its file's name.
+        command: the command that makes this report.
+        retraction: its scene, or the reason why there is none; None where it was not looked for.
+    """
+    outside = (
+        "Top: the whole organ; bottom: cut open through the middle of its largest region, without the part nearer to "
+        "the viewer. Lighter: the face that the probe can press; grey: held, fixed or on fat and ligaments."
+    )
+    return render_page(
+        "organ.html.j2",
+        generator=GENERATOR,
+        title=f"Organ: {found.scene.description}",
+        verdict=verdict(found),
+        notes=[*found.patient.notes, *found.notes],
+        source=_source(found),
+        volumes=_volumes(found),
+        organ_picture=Picture("From three sides", outside, organ_picture(found)),
+        mesh=_mesh(found),
+        regions=_regions(found),
+        step=_step(found),
+        palpation=_palpation(found),
+        retraction=None if retraction is None else told(retraction),
+        scene_text=scene_text,
+        scene_file=scene_file,
+        command=command,
+    )
+
+
+def verdict(found: PatientScene) -> str:
+    """The most important results in a sentence or two."""
+    patient, quality = found.patient, mesh_quality(found.patient.mesh)
+    fits = abs(patient.volume_error) <= VOLUME_ERROR_LARGEST
+    shaped = quality.dihedral_smallest_deg >= DIHEDRAL_SMALLEST
+    said = (
+        f"The mesh has {quality.tet_count} tets and {quality.volume * 1e6:.1f} ml, "
+        f"{patient.volume_error:+.2%} against the file"
+        f"{'' if fits else ' (more than 2 %: use smaller cells)'}; the smallest dihedral angle is "
+        f"{quality.dihedral_smallest_deg:.1f} degrees{'' if shaped else ' (below 10: it makes the step short)'}."
+    )
+    count = len(patient.lesions)
+    said += (
+        f" {count} segmented lesion{'s are' if count != 1 else ' is'} in it." if count else " No lesion was segmented."
+    )
+    remarks = len(patient.notes) + len(found.notes)
+    return said + (f" {remarks} remark{'s' if remarks != 1 else ''} below." if remarks else "")
+
+
+def _source(found: PatientScene) -> Rows:
+    patient = found.patient
+    return [
+        ("files", ", ".join(patient.sources)),
+        ("axes", patient.convention),
+        ("mesher", f"{patient.mesher}, {patient.cells_text}"),
+    ]
+
+
+def _volumes(found: PatientScene) -> Rows:
+    names = [f"{found.patient.organ_name} (whole)", *(one.name for one in found.patient.volumes[1:])]
+    return [
+        (name, f"{one.source * 1e6:.2f} ml", f"{one.mesh * 1e6:.2f} ml", f"{one.error:+.2%}")
+        for name, one in zip(names, found.patient.volumes, strict=True)
+    ]
+
+
+def _mesh(found: PatientScene) -> Rows:
+    mesh = found.patient.mesh
+    quality = mesh_quality(mesh)
+    x, y, z = np.ptp(mesh.points, axis=0) * 1e3
+    low = " ".join(f"{value * 1e3:.1f}" for value in mesh.points.min(axis=0))
+    return [
+        ("nodes, tets, boundary triangles", f"{mesh.node_count}, {mesh.tet_count}, {quality.boundary_triangle_count}"),
+        ("extent", f"{x:.1f} x {y:.1f} x {z:.1f} mm, from {low} mm"),
+        ("dihedral angles", f"{quality.dihedral_smallest_deg:.1f} to {quality.dihedral_largest_deg:.1f} degrees"),
+        ("radius ratio", f"from {quality.radius_ratio_smallest:.3f}"),
+    ]
+
+
+def _regions(found: PatientScene) -> Rows:
+    mesh, rows = found.patient.mesh, Rows()
+    for tag, name in mesh.region_names:
+        what, volume = found.organ if tag == 1 else found.regions[name], float(mesh.volumes[mesh.region == tag].sum())
+        modulus, ratio = f"{what.material.youngs_modulus:g} Pa", f"{what.material.poisson_ratio:g}"
+        mass = f"{volume * what.material.density:.4f} kg"
+        rows.append((name, f"{volume * 1e6:.2f} ml", mass, modulus, ratio, what.source))
+    return rows
+
+
+def _step(found: PatientScene) -> Rows:
+    anatomy, scene = found.anatomy, found.scene
+    organ = compile_organ(anatomy.specification(anatomy.demonstration_lesions()))
+    capsule, in_contact = scene.capsule, stable_dt(organ, scene.contact.law)
+    shell = "none" if capsule is None else f"{capsule.youngs_modulus:g} Pa, {capsule.thickness or 0.0:g} m"
+    return [
+        ("total mass", f"{organ.node_mass.sum():.4f} kg"),
+        ("springs", f"{len(organ.spring_nodes)}"),
+        ("held by", "; ".join(held_text(one) for one in scene.anchors)),
+        ("fixed and elastically held nodes", f"{len(anatomy.anchors)} and {len(anatomy.foundation_nodes)}"),
+        ("capsule", f"{shell}, over {len(organ.surface_triangles)} free boundary triangles"),
+        ("stable step", f"{organ.stable_step * 1e3:.3f} ms, in contact {in_contact * 1e3:.3f} ms"),
+        ("substeps in a haptic step of 1 ms", f"{scene.timing.substep_count}"),
+    ]
+
+
+def _palpation(found: PatientScene) -> Rows:
+    scene, palpation = found.scene, found.scene.palpation
+    tip, depth = scene.instrument.tip_radius, palpation.press_depth
+    x, y, z = scene.instrument.approach
+    return [
+        ("tip and press", f"ball of {tip * 1e3:g} mm radius, {depth * 1e3:g} mm deep"),
+        ("approach", f"{x:g}, {y:g}, {z:g}"),
+        ("sites", f"{found.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
+        ("cell / contact radius", share_text(found.anatomy.palpable_cell, tip, depth)),
+        ("contact", hidden_text(2.0 * hertz_force(scene.material, tip, depth), tip, depth, scene.contact.stiffness)),
+        ("held", "not checked" if found.hold is None else found.hold.text),
+        ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
+    ]
+
+
+def organ_picture(found: PatientScene) -> bytes:
+    """PNG of three views: above whole with the palpable face and the anchors, below cut open through a region."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.5, 8.6), dpi=100, facecolor=PAPER, layout="constrained")
+    axes = figure.subplots(2, 3)
+    mesh = found.anatomy.mesh
+    patches = organ_patches(found.anatomy)
+    colours = _outer_colours(found)[patches.origin]
+    through = _through(found)
+    for column, (along, up, of_scan, of_file) in enumerate(SIDES):
+        view = OrthographicView.along(np.array(along), up=np.array(up))
+        draw_patches(axes[0, column], [(patches, colours, 0.12)], view)
+        _draw_cut(axes[1, column], mesh, patches, colours, through, view)
+        axes[0, column].set_title(of_scan if found.patient.is_scan else of_file, color=INK, fontsize=11)
+        axes[1, column].set_title("cut open there", color=INK, fontsize=11)
+    for one in axes.flat:
+        one.set_aspect("equal")
+        one.set_axis_off()
+    _scale_bar(axes[0, 0], mesh)
+    _legend(figure, found)
+    return _png(figure)
+
+
+def _outer_colours(found: PatientScene) -> FloatArray:
+    """Colours of the boundary triangles (n_triangle, 3)."""
+    mesh, anatomy = found.anatomy.mesh, found.anatomy
+    triangles = mesh.boundary_triangles
+    colours = np.broadcast_to(TISSUE, (len(triangles), 3)).copy()
+    palpable = {tuple(row) for row in anatomy.face.triangles.tolist()}
+    colours[[tuple(row) in palpable for row in triangles.tolist()]] = PALPABLE
+    held = np.concatenate([anatomy.anchors, anatomy.foundation_nodes])
+    colours[np.isin(triangles, held).all(axis=1)] = HELD
+    tags = mesh.region[mesh.boundary_tets]
+    for tag, colour in _region_colours(mesh).items():
+        colours[tags == tag] = colour
+    return colours
+
+
+def _region_colours(mesh: TetMesh) -> dict[int, FloatArray]:
+    return {tag: REGIONS[number % len(REGIONS)] for number, (tag, _) in enumerate(mesh.region_names[1:])}
+
+
+def _through(found: PatientScene) -> FloatArray:
+    """A point on the cutting planes [m]: the centre of the largest region, lesions first, or of the organ."""
+    mesh = found.anatomy.mesh
+    inner = found.patient.volumes[1:]
+    if not inner:
+        return matmul(mesh.volumes, mesh.points[mesh.tets].mean(axis=1)) / mesh.volumes.sum()
+    largest = max(inner, key=lambda one: (one.name in found.patient.lesions, one.mesh)).name
+    return lesion_extent(mesh, Lesion(region=largest, material=found.organ.material, name=largest))[0]
+
+
+def _draw_cut(
+    axes: Axes, mesh: TetMesh, patches: Patches, colours: FloatArray, through: FloatArray, view: OrthographicView
+) -> None:
+    """Draw the part behind the plane through a point that faces the viewer, and the section in its regions' colours."""
+    from matplotlib.collections import PolyCollection
+
+    behind = matmul(patches.corners.mean(axis=1) - through, view.towards) < 0.0
+    kept = Patches(patches.corners[behind], patches.normals[behind], patches.origin[behind])
+    draw_patches(axes, [(kept, colours[behind], 0.12)], view)
+    polygons, tags = section(mesh, through, view.towards)
+    tints = _region_colours(mesh)
+    faces = np.array([tints.get(int(tag), SECTION) for tag in tags]).reshape(-1, 3)
+    flat = [view.flat(polygon) for polygon in polygons]
+    axes.add_collection(PolyCollection(flat, facecolors=faces, edgecolors=0.8 * faces, linewidths=0.25, zorder=3))
+    axes.autoscale_view()
+
+
+def section(mesh: TetMesh, through: FloatArray, normal: FloatArray) -> tuple[list[FloatArray], IntArray]:
+    """Sections of tets with a plane: polygons of 3 or 4 points [m] and the tets' region tags."""
+    height = matmul(mesh.points - through, normal)
+    polygons: list[FloatArray] = []
+    cut = []
+    for tets, edges in cut_edges(mesh.tets, height):
+        start, end = height[edges[..., 0]], height[edges[..., 1]]
+        share = (start / (start - end))[..., None]
+        polygons.extend(mesh.points[edges[..., 0]] * (1.0 - share) + mesh.points[edges[..., 1]] * share)
+        cut.append(tets)
+    owner = np.concatenate(cut)
+    order = np.argsort(owner)
+    return [polygons[one] for one in order], mesh.region[owner[order]]
+
+
+def _scale_bar(axes: Axes, mesh: TetMesh) -> None:
+    length = 50.0 if np.ptp(mesh.points, axis=0).max() > 0.08 else 10.0
+    low, bottom = axes.get_xlim()[0], axes.get_ylim()[0]
+    axes.plot([low, low + length], [bottom, bottom], color=INK, lw=2.5)
+    axes.annotate(f"{length:g} mm", (low, bottom), (0, 4), textcoords="offset points", color=INK, fontsize=9)
+
+
+def _legend(figure: Figure, found: PatientScene) -> None:
+    from matplotlib.patches import Patch
+
+    mesh = found.anatomy.mesh
+    names = dict(mesh.region_names)
+    entries = [(PALPABLE, "palpable face"), (HELD, "held"), (SECTION, f"{found.patient.organ_name}, cut")]
+    entries += [(colour, names[tag]) for tag, colour in _region_colours(mesh).items()]
+    figure.legend(
+        handles=[Patch(color=tuple(colour), label=name) for colour, name in entries[:10]],
+        loc="outside lower center",
+        ncols=5,
+        frameon=False,
+    )
+
+
+def _png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", facecolor=PAPER, metadata={"Software": None})
+    return stream.getvalue()

@@ -1,0 +1,89 @@
+"""What holds a patient's organ: fat and wall on the side away from the probe, and attachments by the organ's name."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from msdm_core.arithmetic import matmul, norm
+from msdm_core.mesh import FloatArray, TetMesh
+from surgsim_apps.palpate.scene_options import FAT_NAME, FAT_SOURCE, soft_bed
+from surgsim_env.scene import Anchor, Ball, Vector
+
+# Stiffness of ligaments and of a hilum, per area [N/m^3]: chosen, four times that of fat: 1 mm under 1 kPa.
+LIGAMENT_STIFFNESS, LIGAMENT_SHEAR_STIFFNESS = 1.0e6, 3.3e5
+LIGAMENT_SOURCE = "[N/m^3] chosen, four times that of fat; no source was found; place and size are chosen: edit them"
+PLACE_DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A place where anatomy attaches an organ.
+
+    Args:
+        name: of the tissue.
+        direction: from the organ's middle in the axes of a scan: x to the patient's left, y to the back, z to the head.
+        radius: of the ball around the surface point there, over the organ's largest extent.
+    """
+
+    name: str
+    direction: Vector
+    radius: float
+
+
+# Names of the fat around organs, and their attachments, by a word of the organ's name.
+FAT_NAMES: Mapping[str, str] = {"kidney": "perirenal fat and Gerota's fascia"}
+ATTACHMENTS: Mapping[str, tuple[Attachment, ...]] = {
+    "liver": (
+        Attachment("bare area and coronary ligaments", (-0.35, 0.75, 0.55), 0.16),
+        Attachment("falciform ligament", (0.15, -0.2, 0.97), 0.06),
+    ),
+    "spleen": (Attachment("hilum", (-0.9, -0.4, 0.0), 0.14),),
+    "kidney": (Attachment("hilum", (-1.0, -0.3, 0.0), 0.10),),
+}
+
+
+def organ_anchors(
+    organ_name: str, mesh: TetMesh, approach: Vector, *, is_scan: bool
+) -> tuple[tuple[Anchor, ...], dict[str, str]]:
+    """The anchors of a patient's organ, and where their numbers come from by the path of their entry in a scene.
+
+    Attachments need the axes of a scan: in a surface's axes nobody knows where
+    the back is, and only the fat holds it.
+
+    Args:
+        organ_name: such as "left kidney".
+        mesh: of the organ.
+        approach: of the probe, of length 1.
+        is_scan: whether the axes are those of a scan.
+    """
+    word = next((one for one in ATTACHMENTS if one in organ_name.lower()), "")
+    anchors = [soft_bed(approach, FAT_NAMES.get(word, FAT_NAME))]
+    sources = {"anchors[0].stiffness": FAT_SOURCE, "anchors[0].side": "away from the probe"}
+    for one in ATTACHMENTS.get(word, ()) if is_scan else ():
+        direction = np.array(one.direction)
+        if word == "kidney" and "right" in organ_name.lower():
+            direction[0] *= -1.0
+        x, y, z = np.round(_surface_point(mesh, direction), PLACE_DIGITS).tolist()
+        radius = round(one.radius * float(np.ptp(mesh.points, axis=0).max()), PLACE_DIGITS)
+        sources[f"anchors[{len(anchors)}].stiffness"] = LIGAMENT_SOURCE
+        ball = Ball((x, y, z), radius)
+        anchors.append(
+            Anchor(one.name, ball=ball, stiffness=LIGAMENT_STIFFNESS, shear_stiffness=LIGAMENT_SHEAR_STIFFNESS)
+        )
+    return tuple(anchors), sources
+
+
+def _surface_point(mesh: TetMesh, direction: FloatArray) -> FloatArray:
+    """The surface node that lies best in a direction from the organ's centroid [m], (3,)."""
+    centre = matmul(mesh.volumes, mesh.points[mesh.tets].mean(axis=1)) / mesh.volumes.sum()
+    surface = mesh.points[mesh.boundary_nodes]
+    away = surface - centre
+    return surface[int(np.argmax(matmul(away, direction) / norm(away, axis=1)))]
+
+
+def held_text(anchor: Anchor) -> str:
+    """An anchor in words, for reports."""
+    if anchor.stiffness is None or anchor.shear_stiffness is None:
+        return f"{anchor.name}: fixed"
+    return f"{anchor.name}: {anchor.stiffness:g} N/m^3 along the normal, {anchor.shear_stiffness:g} N/m^3 across"

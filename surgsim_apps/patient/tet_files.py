@@ -1,0 +1,146 @@
+"""A patient's organ from a file of tets: its own tets as they are, or its surfaces, to be filled anew."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from msdm_core.errors import MeshError
+from msdm_core.mesh import (
+    TET_FACES,
+    FloatArray,
+    IntArray,
+    TetMesh,
+    check_surface,
+    in_sweep_order,
+    merge_vertices,
+    outward_facing,
+    surface_cell,
+)
+from msdm_core.mesh_files import LengthUnit
+from surgsim_apps.patient.label_image import LabelName
+from surgsim_apps.patient.materials import is_lesion
+from surgsim_apps.patient.meshers import FILE_CONVENTION, PatientMesh, PatientSurfaces, region_volumes
+from surgsim_apps.patient.surface_files import ClosedSurface, Triangles, bodies_of, region_name
+from surgsim_env.scene import Vector
+
+
+@dataclass(frozen=True, eq=False)
+class PatientTets:
+    """Tets of an organ whose regions are named.
+
+    Fields:
+        mesh: tags from 1 on, the organ's own first, all of them named; in metres
+        source: name of the file
+    """
+
+    mesh: TetMesh
+    source: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the regions, the organ's own first."""
+        return tuple(name for _, name in self.mesh.region_names)
+
+    @property
+    def volume(self) -> float:
+        """Volume of the whole organ [m^3]."""
+        return float(self.mesh.volumes.sum())
+
+    def face_cell(self, approach: Vector, face_angle_deg: float) -> float:
+        """Edge of the cubic cells that would have tets as large as those at the face towards a direction [m]."""
+        triangles = self.mesh.boundary_triangles
+        facing = outward_facing(self.mesh.points, triangles, approach, face_angle_deg)
+        if not facing.any():
+            raise MeshError(f"{self.source}: no part of its surface faces the approach {approach}: give another")
+        return surface_cell(self.mesh, triangles[facing])
+
+
+def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[LabelName]) -> PatientTets:
+    """The tets of a file, with names for their regions.
+
+    Args:
+        file: vtu, vtk, msh or mesh.
+        length_unit: may be left out for files that state it.
+        labels: names of the tags, the organ's first; empty for files that name their regions, of which the largest is
+            then the organ, or that have one region, which is named after the file.
+
+    Raises:
+        MeshError: a file that is no organ, tags without names, names without tets.
+    """
+    from msdm_core.mesh_files import read_mesh
+
+    mesh = read_mesh(file, length_unit=length_unit)
+    there = np.unique(mesh.region).tolist()
+    named = dict(mesh.region_names) if not labels else {one.value: one.name for one in labels}
+    if len(there) == 1 and not labels:
+        named = {there[0]: named.get(there[0], region_name(file))}
+    nameless = [tag for tag in there if tag not in named]
+    if nameless:
+        raise MeshError(
+            f"{file}: regions {', '.join(map(str, nameless))} of {', '.join(map(str, there))} have no name: "
+            "give --labels NAME=TAG,... with the organ first, such as liver=1,lesion=2"
+        )
+    absent = [f"{name}={tag}" for tag, name in named.items() if tag not in there]
+    if absent and labels:
+        raise MeshError(
+            f"{file}: --labels {','.join(absent)}: no tet has this tag; those there are {', '.join(map(str, there))}"
+        )
+    order = [tag for tag in named if tag in there]
+    if not labels:
+        order.sort(key=lambda tag: -float(mesh.volumes[mesh.region == tag].sum()))
+    tags = np.zeros(mesh.tet_count, dtype=np.int32)
+    for number, tag in enumerate(order, start=1):
+        tags[mesh.region == tag] = number
+    names = tuple((number, named[tag]) for number, tag in enumerate(order, start=1))
+    return PatientTets(in_sweep_order(TetMesh(mesh.points, mesh.tets, tags, names)), file.name)
+
+
+def patient_of_tets(given: PatientTets, cell_size: float) -> PatientMesh:
+    """The organ with the tets of the file, whose cells at the pressed face are of a size [m]."""
+    mesh, names = given.mesh, given.names
+    volumes = {tag: float(mesh.volumes[mesh.region == tag].sum()) for tag, _ in mesh.region_names}
+    return PatientMesh(
+        mesh=mesh,
+        lesions=tuple(name for name in names[1:] if is_lesion(name)),
+        volumes=region_volumes(mesh, names, given.volume, volumes),
+        cell_size=cell_size,
+        coarsening=1,
+        mesher="the file's tets",
+        convention=FILE_CONVENTION,
+        sources=(given.source,),
+        notes=(),
+        is_scan=False,
+    )
+
+
+def surfaces_of_tets(given: PatientTets) -> PatientSurfaces:
+    """The surfaces of the organ and of its regions, to be filled with tets anew.
+
+    Raises:
+        MeshError: a region whose tets enclose no single body each, such as tets that share an edge alone.
+    """
+    mesh, names = given.mesh, given.names
+    organ = ClosedSurface(names[0], *_closed(mesh.points, mesh.boundary_triangles, f"{given.source}: {names[0]}"))
+    inner = []
+    for tag, name in mesh.region_names[1:]:
+        bodies = bodies_of(mesh.points, _boundary(mesh.tets[mesh.region == tag]).astype(np.int64))
+        for number, body in enumerate(bodies, start=1):
+            one = name if len(bodies) == 1 else f"{name} {number}"
+            inner.append(ClosedSurface(one, *_closed(*body, f"{given.source}: {one}")))
+    return PatientSurfaces(organ, tuple(inner), (given.source,), ())
+
+
+def _closed(points: FloatArray, triangles: IntArray | Triangles, what: str) -> tuple[FloatArray, Triangles]:
+    try:
+        return check_surface(*merge_vertices(points, triangles))
+    except MeshError as error:
+        raise MeshError(f"{what}: {error}; leave --remesh out to keep its tets") from None
+
+
+def _boundary(tets: IntArray) -> IntArray:
+    """The outward triangles that belong to one of some tets alone, shape (n, 3)."""
+    faces = tets[:, TET_FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[count == 1]]

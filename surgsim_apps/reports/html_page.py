@@ -1,0 +1,61 @@
+"""Reports as single HTML files: no scripts, nothing loaded from anywhere, pictures embedded; for any browser.
+
+A report is a template in `templates/` that extends `base.html.j2`. It sets `title`, `verdict` (the first paragraph) and
+`sections`, a list of (id, heading, content); sections without content are left out. `parts.html.j2` has the macros for
+tables and pictures. All values are escaped.
+"""
+
+import base64
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+# The browser itself refuses to load anything.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A PNG picture of a report.
+
+    Fields:
+        title: heading of its caption
+        description: what it shows, in the caption and as the alternative text
+        png: the picture itself
+        name: of its file; "" where it has none
+    """
+
+    title: str
+    description: str
+    png: bytes
+    name: str = ""
+
+    @classmethod
+    def of_file(cls, path: Path, title: str, description: str) -> "Picture":
+        """The picture that a PNG file holds."""
+        return cls(title, description, path.read_bytes(), path.name)
+
+    @property
+    def url(self) -> str:
+        """A URL that contains the picture."""
+        return f"data:image/png;base64,{base64.b64encode(self.png).decode('ascii')}"
+
+
+def render_page(template: str, *, generator: str = "surgsim", **values: Any) -> str:
+    """The text of a page: a template of `templates/` with its values; `generator` names the program that makes it."""
+    return _templates().get_template(template).render(generator=generator, policy=POLICY, **values)
+
+
+@cache
+def _templates() -> Environment:
+    return Environment(
+        loader=PackageLoader("surgsim_apps.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )

@@ -1,0 +1,419 @@
+"""Play episodes of given seeds side by side, record them, and the figures of a policy.
+
+An agent draws from `agent_generator(seed)`, which no environment uses. One whose class declares `sees_truth = True` is
+given the task with the truth by its method `see`; no other is given it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from surgsim_apps.training.site_agent import site_facts
+from surgsim_env.palpation import (
+    HOLD_TIME,
+    PRESS_SPEED,
+    MapScore,
+    PalpationRecord,
+    ScoreEstimate,
+    press_errors,
+    with_intervals,
+)
+from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
+from surgsim_env.tasks import SUCCESS_ERROR, PalpateSitesTask
+
+# Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
+AGENT_STREAM = 0x41_67_65_6E_74
+# Actions (n, n_action) for observations (n, n_observation), or for a dictionary of arrays (n, ...); where the second
+# (n,) is true an episode begins.
+Actor = Callable[[Any, NDArray[np.bool_]], NDArray[Any]]
+
+
+@runtime_checkable
+class EpisodeActor(Protocol):
+    """An `Actor` that is told where an episode begins and ends, as one with random numbers or a memory has to be."""
+
+    def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
+        """Begin an episode in environment `index`, with random numbers that follow from its seed."""
+        ...
+
+    def end(self, index: int) -> None:
+        """The episode of environment `index` is over, if there was one."""
+        ...
+
+    def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[Any]:
+        """Actions, as an `Actor` gives them."""
+        ...
+
+
+def make_envs(
+    env_id: str, count: int, *, dtype: str = "float32", threads: int = 1, **kwargs: Any
+) -> gym.vector.VectorEnv:
+    """Environments side by side that reset when `play` says so."""
+    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "dtype": dtype}
+    return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
+
+
+def agent_generator(seed: int) -> np.random.Generator:
+    """The random numbers of the agent that plays the episode of a seed.
+
+    An environment draws its episode from `default_rng(seed)`: an agent with that generator could redraw the lesions.
+    This one begins with words that a child of the seed's `SeedSequence` gives, so that it holds neither the seed nor
+    the environment's numbers.
+    """
+    child = np.random.SeedSequence(seed, spawn_key=(AGENT_STREAM,))
+    return np.random.default_rng(child.generate_state(8).tolist())
+
+
+def play(
+    actor: Actor | EpisodeActor,
+    envs: gym.vector.VectorEnv,
+    seeds: Sequence[int],
+    begin: Callable[[int, int], Any],
+    progress: Callable[[int], object] = lambda ended: None,
+) -> list[Any]:
+    """Play an episode of each seed and return its record; where one ends the next seed begins.
+
+    Environments for which no seed is left are paused (`LaneVectorEnv.pause`).
+
+    Args:
+        actor: what plays. An episode's record does not depend on the others where the actor's actions do not: those
+            of an `EpisodeActor` may draw from the random numbers of each episode.
+        envs: of `make_envs`.
+        seeds: of the episodes.
+        begin: makes the record of an episode from the index of its environment and its seed; its `note` takes steps.
+        progress: called after each step with the number of episodes that ended.
+    """
+    lanes = envs.unwrapped
+    waiting, records = list(range(len(seeds))), dict[int, Any]()
+    playing: list[int | None] = [None] * envs.num_envs
+    observations, begins = np.zeros(0), np.ones(envs.num_envs, dtype=np.bool_)
+    while True:
+        for env in np.flatnonzero(begins):
+            playing[env] = waiting.pop(0) if waiting else None
+        idle = np.array([index is None for index in playing])
+        if idle.all():
+            return [records[index] for index in range(len(seeds))]
+        # All environments are reset once, with the first seed where there is no other: an observation is of all.
+        resets = begins & ~idle if records else np.ones_like(begins)
+        if resets.any():
+            starts = [int(seeds[index or 0]) for index in playing]
+            observations, _ = envs.reset(seed=starts, options={"reset_mask": resets})  # type: ignore[arg-type]
+        for env in np.flatnonzero(begins):
+            index = playing[env]
+            if isinstance(actor, EpisodeActor):
+                actor.end(int(env))
+            if index is not None:
+                if isinstance(actor, EpisodeActor):
+                    actor.begin(int(env), lanes.envs[env], agent_generator(int(seeds[index])))  # type: ignore[attr-defined]
+                records[index] = begin(int(env), int(seeds[index]))
+        if begins.any() and idle.any():
+            lanes.pause(idle)  # type: ignore[attr-defined]
+        observations, rewards, terminated, truncated, infos = envs.step(actor(observations, begins))
+        begins = (terminated | truncated) & ~idle
+        for env, index in enumerate(playing):
+            if index is not None:
+                info = {name: values[env] for name, values in infos.items() if not name.startswith("_")}
+                records[index].note(float(rewards[env]), info, bool(begins[env]))
+        progress(int(begins.sum()))
+
+
+# ---- agents, one for each episode ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EpisodeFacts:
+    """Constants of an environment whose steps are control steps.
+
+    Fields:
+        env_id, env_kwargs: of the environment; an agent may make one of its own from them
+        observation_slices: entries of an observation, by channel
+        action_size: entries of an action, each in [-1, 1]
+        control_step: duration of a step [s]
+        step_count: most steps of an episode
+        soft_force, hard_force: limits of the contact force [N]
+    """
+
+    env_id: str
+    env_kwargs: dict[str, Any]
+    observation_slices: dict[str, slice]
+    action_size: int
+    control_step: float
+    step_count: int
+    soft_force: float
+    hard_force: float
+
+
+def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeFacts:
+    """The facts of an environment (its wrappers do not matter)."""
+    single = env.unwrapped
+    return EpisodeFacts(
+        env_id=env_id,
+        env_kwargs=dict(env_kwargs),
+        observation_slices=single.observation_slices,
+        action_size=single.action_space.shape[0],
+        control_step=single.scene.timing.control_step,
+        step_count=single.task.episode_steps or 0,
+        soft_force=single.scene.limits.soft_force,
+        hard_force=single.scene.limits.hard_force,
+    )
+
+
+def sees_truth(agent: object) -> bool:
+    """Whether an agent's class declares that it may see the truth."""
+    return bool(getattr(type(agent), "sees_truth", False))
+
+
+def check_agent(agent: object, name: str) -> None:
+    """Check that an agent has the methods that an episode calls; messages call it `name`.
+
+    Raises:
+        ValueError: a method is missing, or `see` is there and its class does not declare that it sees the truth.
+    """
+    has = {
+        method: callable(getattr(type(agent), method, None))
+        for method in ("reset", "act", "see", "estimate", "estimate_map")
+    }
+    needed = ("reset", "act", *["see"] * sees_truth(agent), *["estimate_map"] * has["estimate"])
+    for method in needed:
+        if not has[method]:
+            raise ValueError(f"{name} has no method {method}: docs/own_agent.md says what an agent has")
+    if has["see"] and not sees_truth(agent):
+        raise ValueError(
+            f"{name} has a method see, which takes the task with the truth, and its class does not declare "
+            "sees_truth = True: declare it, or call the method otherwise"
+        )
+
+
+class AgentActor:
+    """An agent for each episode, with random numbers that no environment uses."""
+
+    def __init__(self, make: Callable[[], Any], facts: Callable[[Any], Any] = site_facts) -> None:
+        """Play agents that `make` gives.
+
+        Args:
+            make: an agent as docs/own_agent.md says.
+            facts: gives an agent the constants of its environment, by default `SiteFacts`.
+        """
+        self.make, self.facts = make, facts
+        self.agents: dict[int, Any] = {}
+        self._idle = np.zeros(0, dtype=np.float32)
+
+    def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
+        """Make the agent of an episode in environment `index`."""
+        agent = self.agents[index] = self.make()
+        self._idle = np.zeros(env.action_space.shape, dtype=np.float32)
+        agent.reset(rng, self.facts(env))
+        if sees_truth(agent):
+            agent.see(env.unwrapped.task)
+
+    def end(self, index: int) -> None:
+        """Forget the agent of environment `index`, if there is one."""
+        self.agents.pop(index, None)
+
+    def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """The next action of each agent (n, n_action); 0 where an environment has none."""
+        chosen = [
+            self.agents[index].act(selected_observations(observations, index)) if index in self.agents else self._idle
+            for index in range(len(begins))
+        ]
+        return np.stack(chosen)
+
+
+# ---- SurgSim/Palpate-v0 and Retract-v0 ------------------------------------------------------------------------------
+
+
+@dataclass
+class TaskRecord:
+    """One episode: length in steps, return, largest force of each step [N] and last info."""
+
+    steps: int = 0
+    total: float = 0.0
+    force_peaks: list[float] = field(default_factory=list)
+    last: dict[str, Any] = field(default_factory=dict)
+
+    def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
+        """Add a step."""
+        self.steps, self.total = self.steps + 1, self.total + reward
+        self.force_peaks.append(float(info["force_peak"]))
+        if over:
+            self.last = info
+
+
+def play_tasks(
+    actor: Actor | EpisodeActor,
+    envs: gym.vector.VectorEnv,
+    seeds: Sequence[int],
+    progress: Callable[[int], object] = lambda ended: None,
+) -> list[TaskRecord]:
+    """`play` for the records of these environments."""
+    return play(actor, envs, seeds, lambda env, seed: TaskRecord(), progress)
+
+
+def play_scripts(
+    env: gym.Env, seeds: Sequence[int], *, tracks: bool, progress: Callable[[int], object] = lambda ended: None
+) -> list[TaskRecord]:
+    """Episodes of the oracle's script, one after the other; a script that fails ends its episode without success.
+
+    Args:
+        env: one environment.
+        seeds: of the episodes.
+        tracks: the script follows a surface that moves.
+        progress: called with 1 after each episode.
+    """
+    records = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        try:
+            trace = run_script(env, oracle_script(env, tracks=tracks))
+        except ScriptError as failed:
+            trace = failed.trace
+        peaks = [float(info["force_peak"]) for info in trace.infos]
+        records.append(TaskRecord(len(trace.reward), float(trace.reward.sum()), peaks, trace.infos[-1]))
+        progress(1)
+    return records
+
+
+def task_figures(
+    records: Sequence[TaskRecord], control_step: float, soft_force: float, rng: np.random.Generator
+) -> dict[str, ScoreEstimate]:
+    """The figures of a policy, with bootstrap intervals over episodes.
+
+    Args:
+        records: at least one.
+        control_step: duration of a step [s].
+        soft_force: [N]; an episode counts as gentle where no step's largest force passes it.
+        rng: for the bootstrap.
+    """
+    succeeded = [bool(record.last["success"]) for record in records]
+    columns = {
+        "success": succeeded,
+        # Of successful episodes; the others take the time limit.
+        "seconds": [
+            record.steps * control_step if won else math.nan for record, won in zip(records, succeeded, strict=True)
+        ],
+        "return": [record.total for record in records],
+        "force_peak": [max(record.force_peaks) for record in records],
+        "under_soft_force": [max(record.force_peaks) <= soft_force for record in records],
+        "hard_limit_share": [bool(record.last["hard_limit"]) for record in records],
+        "fault_share": [bool(record.last["sim_fault"]) for record in records],
+    }
+    for name in ("torn", "visible", "grip_force_peak", "pull_force_peak", "pull_force_mean", "slips", "path_length"):
+        if name in records[0].last:
+            columns[name] = [float(record.last[name]) for record in records]
+    if "error_mm" in records[0].last:
+        errors = [float(record.last["error_mm"]) for record in records]
+        columns["error_mm"] = [error if error >= 0.0 else math.nan for error in errors]
+    return with_intervals({name: np.array(values, dtype=np.float64) for name, values in columns.items()}, rng)
+
+
+# ---- SurgSim/PalpateSites-v0 ----------------------------------------------------------------------------------------
+
+
+def play_sites(
+    actor: Actor | EpisodeActor,
+    envs: gym.vector.VectorEnv,
+    seeds: Sequence[int],
+    progress: Callable[[int], object] = lambda ended: None,
+) -> list[PalpationRecord]:
+    """`play` for agents, or for one policy in all environments.
+
+    An agent with methods `estimate` and `estimate_map`, as `surgsim_apps.scoring.site_search.TruthAgent` has them,
+    replaces the estimator.
+    """
+    singles = envs.unwrapped.envs  # type: ignore[attr-defined]
+
+    def begin(index: int, seed: int) -> SiteRecord:
+        agent = actor.agents[index] if isinstance(actor, AgentActor) else None
+        return SiteRecord(singles[index].unwrapped.task, agent if estimates_itself(agent) else None)
+
+    return [one.record for one in play(actor, envs, seeds, begin, progress)]
+
+
+def estimates_itself(agent: object) -> bool:
+    """Whether an agent's own estimate is scored in place of the common estimator's: its class has the method."""
+    return callable(getattr(type(agent), "estimate", None))
+
+
+def site_success(record: PalpationRecord, task: PalpateSitesTask) -> bool:
+    """Whether an episode ended in success, by the estimate that is scored: no harm, and the last error small enough."""
+    harmed = record.hard_limit or bool(record.fault)
+    return not harmed and bool(press_errors(record, task.budget)[-1] <= SUCCESS_ERROR * task.tip_scale)
+
+
+class SiteRecord:
+    """A record of presses; the estimates of `reference`, an agent, replace the estimator's."""
+
+    def __init__(self, task: PalpateSitesTask, reference: Any) -> None:
+        self.task, self.reference = task, reference
+        self.estimates: list[NDArray[np.float64]] = []
+        self.forces: list[tuple[float, float, float]] = []
+
+    def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
+        """Add a press; the last one completes the record."""
+        reference = self.reference
+        said = self.task.estimated if reference is None else self._own_places()
+        self.estimates.append(np.array(said))
+        self.forces.append((float(info["force"]), float(info["force_peak"]), float(info["depth"])))
+        if over:
+            self._complete(info)
+
+    def _complete(self, info: dict[str, Any]) -> None:
+        made = map_score(self.task)
+        force, peak, depth = np.array(self.forces).T
+        self.record = PalpationRecord(
+            truth=self.task.truth.copy(),
+            estimates=self.estimates,
+            cutoff=self.task.cutoff,
+            force=force,
+            force_peak=peak,
+            # A linear ramp on the way in, then the hold.
+            impulse=float((force * (HOLD_TIME + 0.5 * np.maximum(depth, 0.0) / PRESS_SPEED)).sum()),
+            seconds=float(info["seconds"]),
+            path_length=float(info["path_length"]),
+            soft_force=self.task.limits.soft_force,
+            hard_limit=bool(info["hard_limit"]),
+            fault=str(info["sim_fault"]),
+            map=made if self.reference is None else self._own_map(made),
+        )
+
+    def _own_places(self) -> NDArray[np.float64]:
+        """The agent's own estimate."""
+        return np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64).reshape(-1, 3)
+
+    def _own_map(self, made: MapScore) -> MapScore:
+        """The agent's own map beside the truth, which only one that declares it sees."""
+        hidden = {"lesion": np.zeros_like(made.lesion), "outline_true": np.zeros_like(made.outline_true)}
+        said = self.reference.estimate_map(made if sees_truth(self.reference) else replace(made, **hidden))
+        return replace(made, excess=said.excess, outline=said.outline)
+
+
+def map_score(task: PalpateSitesTask) -> MapScore:
+    """The task's last estimate as a map, with the lesions seen along the approach."""
+    estimate, chart = task.estimate, task.charted.chart
+    across, along = estimate.axes
+    points = np.stack(np.meshgrid(across, along), axis=-1)
+    sites = 0.5 * (chart.sites + 1.0) * chart.extent
+    columns, rows = (np.abs(axis[:, None] - sites[:, i]).argmin(axis=0) for i, axis in enumerate((across, along)))
+    cell_area = float((across[1] - across[0]) * (along[1] - along[0]))
+    return MapScore(
+        excess=estimate.excess[rows, columns],
+        lesion=_over_lesion(task, sites),
+        outline=estimate.outline,
+        outline_true=_over_lesion(task, points),
+        cell_area=cell_area,
+    )
+
+
+def _over_lesion(task: PalpateSitesTask, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether places of the chart (..., 2) [m] lie over a lesion, seen along the approach."""
+    over = np.zeros(points.shape[:-1], dtype=bool)
+    chart = task.charted.chart
+    for lesion in task.lesions:
+        centre = 0.5 * (chart.place(lesion.centre) + 1.0) * chart.extent  # type: ignore[arg-type]
+        over |= np.square(points - centre).sum(axis=-1) <= lesion.radius * lesion.radius  # type: ignore[operator]
+    return over

@@ -1,0 +1,448 @@
+"""Play a method on seeds, score it, and write the result: baselines, trained policies, agents of others.
+
+Results of the project's own methods on all evaluation seeds go to agents/results of a checkout, one file per method,
+scene and level. Other results are printed, and written where the option `results` says.
+"""
+
+import datetime
+import importlib
+import math
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+
+from surgsim_apps.scoring.comparison import compare, describe
+from surgsim_apps.scoring.episodes import (
+    Actor,
+    AgentActor,
+    EpisodeActor,
+    TaskRecord,
+    check_agent,
+    episode_facts,
+    estimates_itself,
+    make_envs,
+    play_scripts,
+    play_sites,
+    play_tasks,
+    sees_truth,
+    site_success,
+    task_figures,
+)
+from surgsim_apps.scoring.expert_palpate import PalpateExpert
+from surgsim_apps.scoring.expert_retract import RetractExpert
+from surgsim_apps.scoring.options import ScoringOptions
+from surgsim_apps.scoring.results import (
+    SITES,
+    Result,
+    load_result,
+    seeds_text,
+    shipped_results,
+)
+from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
+from surgsim_apps.training.site_agent import site_facts
+from surgsim_env.palpation import PalpationRecord, press_errors, score, with_intervals
+from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
+from surgsim_env.step_progress import StepProgress
+
+# Seed of the bootstrap.
+BOOTSTRAP_SEED = 0
+# Where a method plays unless options say otherwise.
+PLACES = {"scene": "phantom", "level": "standard"}
+# Arguments of SurgSim/Palpate-v0 with which organs of any size and pose are alike.
+IN_FACE = {"memory": True, "frame": "face"}
+# The members of a family that scores are of.
+SCORED_SPLIT = "test"
+
+
+@dataclass(frozen=True)
+class Player:
+    """What is scored, and where.
+
+    Args:
+        name: of the method.
+        actor: what plays; None: the oracle's script.
+        env_id, kwargs: the environment.
+        chosen_by: the option of `surgsim evaluate` that names it, and its value.
+        sees_truth: whether it may see what is hidden.
+        own_estimate: whether its own estimate is scored.
+        ours: whether its result belongs in agents/results.
+    """
+
+    name: str
+    actor: Actor | EpisodeActor | None
+    env_id: str
+    kwargs: dict[str, Any]
+    chosen_by: tuple[str, str]
+    sees_truth: bool = False
+    own_estimate: bool = False
+    ours: bool = True
+
+
+@dataclass(frozen=True)
+class TaskAgent:
+    """A script for another environment than SurgSim/PalpateSites-v0.
+
+    Args:
+        env_id: the environment's.
+        make: the script, for the environment's arguments.
+        kwargs: further arguments of the environment.
+    """
+
+    env_id: str
+    make: Callable[[dict[str, Any]], Actor]
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
+    """Makes the expert for any organ, which needs torch."""
+
+    def make(kwargs: dict[str, Any]) -> Actor:
+        from surgsim_apps.scoring.expert_organs import OrganExpert
+
+        return OrganExpert(blind=blind).act
+
+    return make
+
+
+TASK_AGENTS = {
+    "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, {"scaled": False}),
+    "expert_palpate": TaskAgent(
+        "SurgSim/Palpate-v0",
+        lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
+        {"memory": True},
+    ),
+    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE),
+    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE),
+}
+
+
+# Environments whose oracle plays its script.
+ORACLES = {
+    "oracle_palpate": "SurgSim/Palpate-v0",
+    "oracle_retract": "SurgSim/Retract-v0",
+    "oracle_bimanual_retract": "SurgSim/BimanualRetract-v0",
+}
+
+
+def policies_folder() -> Path:
+    """The folder of the policies that are shipped."""
+    return agents_folder() / "policies"
+
+
+def named_class(text: str, option: str) -> Any:
+    """The class (or any function that makes an agent) of MODULE:CLASS; modules of the working folder are found too.
+
+    Importing the module runs its code.
+
+    Args:
+        text: MODULE:CLASS.
+        option: where it was given, for messages.
+
+    Raises:
+        ValueError: another text, or no such module or class.
+    """
+    module, _, name = text.partition(":")
+    if not (module and name):
+        raise ValueError(f"{option} is {text!r}; the rule is MODULE:CLASS")
+    # `surgsim` is a script of an environment: Python looks for modules beside it, not in the working folder.
+    if not {"", str(Path.cwd())} & set(sys.path):
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise
+        raise ValueError(f"{option} {text}: there is no module {error.name!r} on Python's path") from None
+    if not callable(getattr(found, name, None)):
+        raise ValueError(f"{option} {text}: {module} has no class {name!r}")
+    return getattr(found, name)
+
+
+def strangers_actor(text: str, option: str, env_id: str, env_kwargs: dict[str, Any]) -> AgentActor:
+    """The actor of the agents of MODULE:CLASS.
+
+    Args:
+        text: MODULE:CLASS.
+        option: where it was given, for messages.
+        env_id: of the environment that it plays.
+        env_kwargs: of the environment, as an agent is given them.
+
+    Raises:
+        ValueError: as in `named_class` and `check_agent`, or it cannot be made without arguments.
+    """
+    make = named_class(text, option)
+    try:
+        agent = make()
+    except TypeError as error:
+        raise ValueError(f"{option} {text}: it is made without arguments, and that failed: {error}") from None
+    check_agent(agent, f"{option} {text}: it")
+    return AgentActor(make, site_facts if env_id == SITES else lambda env: episode_facts(env, env_id, env_kwargs))
+
+
+def evaluate_all(options: ScoringOptions, console: Console) -> None:
+    """Every baseline on the scene and level of the options, then every shipped policy that can play there."""
+    from surgsim_apps.training.policy_files import read_description
+
+    places = _places(options, PLACES)
+    options = replace(options, **places)
+    # The widest raster that the presses of an episode complete, and the three next.
+    widest = math.isqrt(options.budget or gym.make(SITES, **places).unwrapped.task.budget)  # type: ignore[attr-defined]
+    skipped = {f"raster_{side}" for side in RASTER_SIDES if not widest - 3 <= side <= widest}
+    for name in AGENTS:
+        if name not in skipped:
+            evaluate(find_player(name, options), options, console)
+    for path in sorted(policies_folder().glob("*.json")):
+        described = read_description(path)
+        if described.plays_every_scene or described.home_scene == Path(places["scene"]).stem:
+            evaluate(policy_player(path, options), options, console)
+
+
+def find_player(name: str, options: ScoringOptions) -> Player:
+    """The player of a name: a site search, a script of another environment, an oracle, or MODULE:CLASS.
+
+    Raises:
+        ValueError: an unknown name, or a class that is not there.
+    """
+    chosen_by = ("--agent", name)
+    if ":" in name:
+        return _strangers_player(name, options)
+    if name in ORACLES:
+        env_id = ORACLES[name]
+        return Player(name, None, env_id, _places(options, _defaults(env_id)), chosen_by, sees_truth=True)
+    if name in TASK_AGENTS:
+        script = TASK_AGENTS[name]
+        kwargs = _places(options, _defaults(script.env_id)) | script.kwargs
+        return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by)
+    if name not in AGENTS:
+        raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
+    make, kwargs = AGENTS[name], _places(options, PLACES)
+    if name in REFERENCES:
+        # Their estimates do not depend on the presses.
+        kwargs["budget"] = 1
+    return Player(name, AgentActor(make), SITES, kwargs, chosen_by, *_declared(make()))
+
+
+def _strangers_player(name: str, options: ScoringOptions) -> Player:
+    env_id = options.env or SITES
+    for argument in (*PLACES, "split", "motion", "budget"):
+        if argument in options.env_kwargs and getattr(options, argument) is not None:
+            raise ValueError(f"{argument} is given by --{argument} and in --env-arguments: leave one out")
+    own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
+    # A split that --env-arguments name is meant.
+    kwargs = {**_places(options, own), **options.env_kwargs}
+    given = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
+    actor = strangers_actor(name, "--agent", env_id, given)
+    declared = _declared(actor.make())
+    return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, ours=False)
+
+
+def _defaults(env_id: str) -> dict[str, str]:
+    """Scene and level where options give none; of an environment without levels none."""
+    return PLACES if "Palpate" in env_id else {}
+
+
+def _declared(agent: Any) -> tuple[bool, bool]:
+    """`sees_truth` and `own_estimate` of a `Player`."""
+    return sees_truth(agent), estimates_itself(agent)
+
+
+def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]:
+    """Scene, level and split as the options or else the defaults have them; else they are the environment's own.
+
+    A family of organs is scored on its test split unless the options name another, also where a method was trained on
+    the family's training split.
+    """
+    given = {name: getattr(options, name) for name in PLACES if getattr(options, name) is not None}
+    places = {name: value for name, value in {**defaults, **given}.items() if name in PLACES}
+    is_family = places.get("scene") is not None and make_scene(places["scene"]).family is not None
+    if options.split is not None or is_family:
+        places["split"] = options.split or SCORED_SPLIT
+    return places
+
+
+def policy_player(path: Path, options: ScoringOptions) -> Player:
+    """A trained policy on its own environment, or on the scene and level of the options where it can play them.
+
+    Args:
+        path: of either of its files, or the name of a shipped policy.
+        options: of the evaluation.
+
+    Raises:
+        ValueError: no such policy, or one that cannot play there.
+    """
+    from surgsim_apps.training.policy_files import load_policy
+
+    shipped = policies_folder() / f"{path}.json"
+    if shipped.is_file():
+        path = shipped
+    policy = load_policy(path)
+    env_id = policy.description.env_id
+    own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
+    kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
+    policy.reset(min(options.envs, len(options.played_seeds)))
+
+    return Player(
+        *(path.stem, policy, env_id, kwargs, ("--policy", str(_from_here(path)))),
+        ours=path.resolve().parent == policies_folder(),
+    )
+
+
+def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
+    """The environment's arguments, with those that options add.
+
+    Raises:
+        ValueError: an option that this player or its environment cannot take.
+    """
+    kwargs = dict(player.kwargs)
+    if options.motion is not None:
+        kwargs["motion"] = options.motion
+    if options.budget is not None:
+        if player.env_id != SITES:
+            raise ValueError(f"--budget is the number of presses of {SITES}; {player.name} plays {player.env_id}")
+        kwargs["budget"] = options.budget
+    if options.no_tracking:
+        if player.env_id == SITES:
+            kwargs["track_motion"] = False
+        elif player.actor is not None:
+            raise ValueError(
+                f"--no-tracking is for the presses of {SITES} and for oracles; {player.name} moves as it will"
+            )
+    return kwargs
+
+
+def evaluate(player: Player, options: ScoringOptions, console: Console) -> Result:
+    """Play the seeds of the options; print the result and write it where it belongs."""
+    kwargs, seeds, env_id, actor = _arguments(player, options), options.played_seeds, player.env_id, player.actor
+    name = player.name + "_untracked" * options.no_tracking
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    count = 1 if actor is None else min(options.envs, len(seeds))
+    try:
+        envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
+    except (gym.error.Error, TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {env_id} with {kwargs} cannot be made: {error}") from error
+    first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
+    if player.chosen_by[0] == "--policy":
+        actor.check_environment(first, f"policy {name}")  # type: ignore[union-attr]
+    start = time.perf_counter()
+    with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
+        if actor is not None and env_id == SITES:
+            succeeded, scored = _site_scores(play_sites(actor, envs, seeds, ended), first.task, rng)
+        elif actor is not None:
+            succeeded, scored = _task_scores(play_tasks(actor, envs, seeds, ended), first, rng)
+        else:
+            single = gym.make(env_id, **kwargs)
+            records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=ended)
+            succeeded, scored = _task_scores(records, first, rng)
+    taken = time.perf_counter() - start
+    envs.close()
+    result = Result(
+        method=name,
+        env_id=env_id,
+        env_kwargs=_without_folders(kwargs),
+        seeds=tuple(seeds),
+        command=_command(player, options),
+        wall_time=round(taken, 1),
+        date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        physics_version=PHYSICS_VERSION,
+        successes=succeeded,
+        sees_truth=player.sees_truth,
+        own_estimate=player.own_estimate,
+        **scored,
+    )
+    path = _write(result, player, options)
+    values = {name: figure.value for name, figure in result.figures.items()}
+    printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
+    figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
+    where = "not written (--results FOLDER does)" if path is None else f"-> {path}"
+    _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")
+    return result
+
+
+def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
+    """Whether each episode of presses succeeded, and the entries of a `Result` that follow from them."""
+    succeeded = [site_success(record, task) for record in presses]
+    share = {"success": np.array(succeeded, dtype=np.float64)}
+    return succeeded, {
+        "budget": task.budget,
+        "figures": {**score(presses, task.budget, rng), **with_intervals(share, rng)},
+        "errors_mm": [np.round(1000.0 * press_errors(record, task.budget), 2).tolist() for record in presses],
+        "lesion_counts": [len(record.truth) for record in presses],
+    }
+
+
+def _task_scores(records: list[TaskRecord], env: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
+    """Whether each episode of control steps succeeded, and the entries of a `Result` that follow from them."""
+    return [bool(record.last["success"]) for record in records], {
+        "budget": env.task.episode_steps or 0,
+        "figures": task_figures(records, env.scene.timing.control_step, env.scene.limits.soft_force, rng),
+    }
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def _write(result: Result, player: Player, options: ScoringOptions) -> Path | None:
+    """Write a result where it belongs.
+
+    agents/results holds the project's own methods on the project's own scenes alone, as `ScoringOptions.standard` says.
+    """
+    if options.results is not None:
+        return result.save(options.results)
+    own_place = result.env_kwargs.get("scene") in (None, *list_scenes())
+    if player.ours and options.standard and own_place and _checkout() is not None:
+        return result.save(shipped_results())
+    return None
+
+
+def print_comparison(one: Path, other: Path, console: Console) -> None:
+    """Print the differences of the results of two files."""
+    first, second = load_result(one), load_result(other)
+    _say(
+        console,
+        f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap",
+    )
+    for difference in compare(first, second, np.random.default_rng(BOOTSTRAP_SEED)):
+        _say(console, describe(difference, first.method, second.method))
+
+
+def _command(player: Player, options: ScoringOptions) -> str:
+    """The command that repeats a result: what is scored, and the options that change its figures."""
+    words = ["surgsim", "evaluate", *player.chosen_by]
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if option.name in ("envs", "threads", "results") or value == option.default:
+            continue
+        words.append(f"--{option.name.replace('_', '-')}")
+        if value is not True:
+            words.append(_from_here(Path(value)) if Path(str(value)).is_absolute() else str(value))
+    return shlex.join(words)
+
+
+def _without_folders(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Arguments with files relative to the checkout or by their names, so that no machine's folders are written."""
+    return {
+        name: _from_here(Path(value)) if isinstance(value, str) and Path(value).is_absolute() else value
+        for name, value in kwargs.items()
+    }
+
+
+def _from_here(path: Path) -> str:
+    """The path relative to the checkout, so that no machine's folders are written."""
+    absolute, checkout = path.resolve(), _checkout()
+    inside = checkout is not None and absolute.is_relative_to(checkout)
+    return absolute.relative_to(checkout).as_posix() if inside else path.name  # type: ignore[arg-type]
+
+
+def _checkout() -> Path | None:
+    """The folder of the checkout that this package belongs to; None where it is installed."""
+    folder = agents_folder().parent
+    return folder if (folder / "pyproject.toml").is_file() else None

@@ -1,0 +1,71 @@
+"""Where and how `surgsim evaluate` plays a method, as its options say."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from surgsim_apps.scoring.results import read_seeds
+from surgsim_env.palpation import EVALUATION_SEEDS
+
+
+@dataclass(frozen=True)
+class ScoringOptions:
+    """Where and how a method is played; what is not given is the method's own."""
+
+    scene: str | None = None
+    """Default: phantom; for a policy, that of its training."""
+    level: str | None = None
+    """Default: standard; for a policy, that of its training."""
+    split: str | None = None
+    """Of a family of organs: train, validation or test (the default)."""
+    motion: str | None = None
+    """How the patient moves; default: as the scene says."""
+    no_tracking: bool = False
+    """Presses and oracles go where the surface is at rest, as it moves."""
+    seeds: str | None = None
+    """FIRST:LAST or A,B,C; default: the evaluation seeds."""
+    episodes: int | None = None
+    """Play the first of the seeds, so many."""
+    budget: int | None = None
+    """Presses of an episode, in place of the environment's own."""
+    envs: int = 16
+    """Organs side by side."""
+    threads: int = 1
+    """Threads that share them."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Of the lanes."""
+    env: str | None = None
+    """The environment of --agent MODULE:CLASS; default: SurgSim/PalpateSites-v0."""
+    env_arguments: str = "{}"
+    """Of the environment of --agent MODULE:CLASS, as a JSON object."""
+    results: Path | None = None
+    """Folder of result files; default: agents/results of a checkout."""
+
+    def __post_init__(self) -> None:
+        for name in ("envs", "threads"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)
+        if self.episodes is not None and not 1 <= self.episodes <= len(given):
+            raise ValueError(f"--episodes is {self.episodes}; there are 1 to {len(given)} seeds")
+        if not isinstance(self.env_kwargs, dict):
+            raise ValueError(f"--env-arguments is {self.env_arguments!r}; it must be a JSON object")
+
+    @cached_property
+    def played_seeds(self) -> tuple[int, ...]:
+        """Seeds of the episodes."""
+        given = EVALUATION_SEEDS if self.seeds is None else read_seeds(self.seeds)
+        return tuple(given)[: self.episodes]
+
+    @property
+    def standard(self) -> bool:
+        """Whether results are those that are shipped: of all evaluation seeds, presses and lanes as by default."""
+        all_seeds = self.played_seeds == tuple(EVALUATION_SEEDS)
+        return all_seeds and self.budget is None and self.dtype == type(self).dtype
+
+    @cached_property
+    def env_kwargs(self) -> dict[str, Any]:
+        """`env_arguments` as a dictionary."""
+        return json.loads(self.env_arguments)

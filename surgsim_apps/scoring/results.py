@@ -1,0 +1,146 @@
+"""Result files: one method on one environment, with what it takes to compare it with others."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, astuple, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from surgsim_env.palpation import ScoreEstimate
+from surgsim_env.scene import STILL, agents_folder
+
+# JSON has no infinity.
+NEVER = "never"
+SITES = "SurgSim/PalpateSites-v0"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One method on one environment, with the command that reproduces its figures.
+
+    Fields:
+        method: name of an agent or of a policy's file
+        env_id, env_kwargs: the environment
+        seeds: of the episodes; in a file as text, "FIRST:LAST" or "A,B,C"
+        budget: largest number of steps of an episode
+        figures: by name, each a value with its interval
+        successes: whether each episode succeeded
+        command: that produced it
+        wall_time: of all episodes [s], on a machine with other load
+        date: of its end
+        physics_version: that it was played with (`surgsim_env.scene.digest`)
+        errors_mm: OSPA after each press of each episode (PalpateSites only)
+        lesion_counts: lesions of each episode (PalpateSites only)
+        sees_truth: whether the method is declared to see what is hidden
+        own_estimate: whether its own estimate is scored in place of the common estimator's
+    """
+
+    method: str
+    env_id: str
+    env_kwargs: dict[str, Any]
+    seeds: tuple[int, ...]
+    budget: int
+    figures: dict[str, ScoreEstimate]
+    command: str
+    wall_time: float
+    date: str
+    physics_version: int
+    errors_mm: list[list[float]] = field(default_factory=list)
+    lesion_counts: list[int] = field(default_factory=list)
+    successes: list[bool] = field(default_factory=list)
+    sees_truth: bool = False
+    own_estimate: bool = False
+
+    @property
+    def place(self) -> str:
+        """The key that groups tables: environment, scene, level, a split other than "test" and motion."""
+        level, split = self.env_kwargs.get("level") or "", self.env_kwargs.get("split") or ""
+        name = self.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+        parts = [name, self.scene, level, "" if split == "test" else split, self.motion]
+        return "_".join(part for part in parts if part)
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene, also where it was given as a file; "" for the environment's own."""
+        return Path(self.env_kwargs.get("scene") or "").stem
+
+    @property
+    def motion(self) -> str:
+        """How the patient moves; "" for one who holds still."""
+        motion = self.env_kwargs.get("motion") or STILL
+        return "" if motion == STILL else motion
+
+    def save(self, folder: Path) -> Path:
+        """Write it into a folder; replaces an older result of the same method and place."""
+        path = folder / f"{self.place}_{self.method}.json"
+        table = asdict(self)
+        table["seeds"] = seeds_text(self.seeds)
+        table["figures"] = {
+            name: [_written(value) for value in astuple(figure)] for name, figure in self.figures.items()
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
+        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+        return path
+
+
+def shipped_results() -> Path:
+    """The folder of results of the project's own methods."""
+    return agents_folder() / "results"
+
+
+def load_result(path: Path) -> Result:
+    """Read a file of `Result.save`.
+
+    Raises:
+        ValueError: another content (names the file and what is wrong).
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        table["figures"] = {
+            name: ScoreEstimate(*(math.inf if value == NEVER else value for value in values))
+            for name, values in table["figures"].items()
+        }
+        return Result(**{**table, "seeds": read_seeds(table["seeds"])})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} is no result of surgsim evaluate: {type(error).__name__}: {said}") from None
+
+
+def load_results(folder: Path) -> list[Result]:
+    """All results of a folder, by file name."""
+    return [load_result(path) for path in sorted(folder.glob("*.json"))]
+
+
+def read_seeds(text: str) -> tuple[int, ...]:
+    """The seeds of "FIRST:LAST", both included, or of a list "A,B,C".
+
+    Raises:
+        ValueError: another text, or a negative seed.
+    """
+    rule = (
+        f"seeds are {text!r:.60}; the rule is FIRST:LAST, both included, or a list A,B,C of whole numbers, at least 0"
+    )
+    if not isinstance(text, str) or not re.fullmatch(r"\d+(:\d+|(,\d+)*)", text):
+        raise ValueError(rule)
+    if ":" in text:
+        first, last = map(int, text.split(":"))
+        if first > last:
+            raise ValueError(f"{rule}; FIRST is at most LAST")
+        return tuple(range(first, last + 1))
+    return tuple(map(int, text.split(",")))
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Seeds as `read_seeds` takes them."""
+    if len(seeds) > 1 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]}:{seeds[-1]}"
+    return ",".join(map(str, seeds))
+
+
+def _written(value: float | None) -> float | str | None:
+    if value is None:
+        return None
+    return NEVER if math.isinf(value) else float(f"{value:.5g}")

@@ -1,0 +1,244 @@
+"""The methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
+
+Searches use observations and the size of the chart only (`SiteFacts`). Methods that see the truth declare it in
+`sees_truth`. A Gaussian process on log contrast is the belief
+of the searches `gp_*`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from surgsim_apps.training.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
+from surgsim_env.palpation import MapScore
+from surgsim_env.tasks import PalpateSitesTask
+
+# Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
+UCB_BETA = 3.0
+LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
+# The points of the face [m] (k, 3) at places of the chart (k, 2), each in [-1, 1].
+Surface = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+class RandomSites:
+    """Presses places that are uniformly distributed over the chart."""
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        self.rng = rng
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        return self.rng.uniform(-1.0, 1.0, 2).astype(np.float32)
+
+
+class RasterSites:
+    """Presses the centres of `side` x `side` equal fields in boustrophedon order.
+
+    Further presses go to the corners of the fields, `side` + 1 per side, and then through both again.
+    """
+
+    def __init__(self, side: int) -> None:
+        middles, corners = (np.arange(side) + 0.5) / side, np.arange(side + 1) / side
+        self.actions = 2.0 * np.concatenate([_there_and_back(middles), _there_and_back(corners)]) - 1.0
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        self.count = 0
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        self.count += 1
+        return self.actions[(self.count - 1) % len(self.actions)].astype(np.float32)
+
+
+def _there_and_back(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All pairs of an axis' values, each second row in reverse, shape (n n, 2)."""
+    rows = [np.column_stack([axis[:: 1 if row % 2 == 0 else -1], np.full(len(axis), y)]) for row, y in enumerate(axis)]
+    return np.concatenate(rows)
+
+
+class SobolSites:
+    """Presses a low-discrepancy sequence (Sobol 1967), scrambled anew in each episode (Owen 1998).
+
+    It covers the chart more evenly than chance does and, unlike a raster, after any number of presses.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        powers = (facts.budget - 1).bit_length()
+        self.places = iter(qmc.Sobol(2, scramble=True, rng=rng).random_base2(powers))
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        return (2.0 * next(self.places) - 1.0).astype(np.float32)
+
+
+class GpVariance:
+    """Variance reduction: presses the site of the largest standard deviation of the Gaussian process.
+
+    The deviation does not depend on the measured contrast: the presses fill the chart evenly, a raster of any length.
+    """
+
+    # Whether the first presses are a raster (`SiteProcess.first`).
+    begins_with_raster: ClassVar[bool] = False
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+        self.rng, self.process, self.count = rng, SiteProcess(facts), 0
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        first = self.process.first(self.count) if self.begins_with_raster else None
+        self.count += 1
+        if first is not None:
+            return first
+        return self.process.best(self.worth(self.process.belief(observation)), observation, self.rng)
+
+    def worth(self, belief: Belief) -> NDArray[np.float64]:
+        """The acquisition function at each site (n n,)."""
+        return belief.spread
+
+
+class GpUcb(GpVariance):
+    """GP-UCB (Srinivas et al. 2010): presses where mean + UCB_BETA x deviation of the excess is highest."""
+
+    begins_with_raster = True
+
+    def worth(self, belief: Belief) -> NDArray[np.float64]:
+        """The upper confidence bound."""
+        return belief.excess + UCB_BETA * belief.spread
+
+
+class GpLevelSet(GpVariance):
+    """Level-set search: presses where it is most uncertain whether there is a lesion.
+
+    Implicit level sets by upper confidence bounds, ILS-UCB (Garg et al. 2016, "Tumor localization using automated
+    palpation with Gaussian process adaptive sampling"; Gotovos et al. 2013): the level h is a share of the largest
+    expected excess, and the site of the largest ambiguity min(upper bound - h, h - lower bound) is pressed: outlines of
+    lesions and unexplored regions.
+    """
+
+    begins_with_raster = True
+
+    def worth(self, belief: Belief) -> NDArray[np.float64]:
+        """The ambiguity; the level is at least the least excess that the estimator reports as a lesion."""
+        excess, margin = belief.excess, LEVEL_BETA * belief.spread
+        level = max(self.process.facts.excess_least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
+        return np.minimum(excess + margin - level, level - excess + margin)
+
+
+class OracleSites(GpVariance):
+    """Presses where the process is least certain, and the true lesions last.
+
+    It bounds what presses and the common estimator allow. Pressing around the lesions is worse: it leaves too few
+    presses elsewhere to tell the healthy tissue's background.
+    """
+
+    sees_truth: ClassVar[bool] = True
+
+    def see(self, task: PalpateSitesTask) -> None:
+        """Take the truth of the episode that `reset` has begun."""
+        places = [task.charted.chart.place(point) for point in task.truth]
+        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        left = self.process.facts.budget - self.count
+        action = super().act(observation)
+        return self.places[left - 1] if left <= len(self.places) else action
+
+
+class OracleNear(OracleSites):
+    """Presses the true lesions first, then a place far from all of them, then around each, then as `OracleSites`.
+
+    A search has to find lesions before it can do so: it bounds how few presses locate them by the common estimator.
+    """
+
+    # Directions around a lesion, and the distance over the lesions' mean radius.
+    around: ClassVar[NDArray[np.float64]] = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]])
+    distance: ClassVar[float] = 0.9
+
+    def see(self, task: PalpateSitesTask) -> None:
+        """Take the truth of the episode that `reset` has begun."""
+        super().see(task)
+        facts = self.process.facts
+        lesions = 0.5 * (np.array(self.places, dtype=np.float64).reshape(-1, 2) + 1.0) * facts.extent
+        squared = np.square(facts.sites[:, None] - lesions).sum(axis=2).min(axis=1, initial=np.inf)
+        far = facts.sites[np.argmax(np.where(self.process.candidates, squared, -np.inf))]
+        rings = [lesions + self.distance * facts.lesion_radius * way for way in self.around]
+        self.first_places = np.concatenate([lesions, far[None], *rings])
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Where to press next."""
+        if self.count < len(self.first_places):
+            self.count += 1
+            return self.process.facts.action(self.first_places[self.count - 1])
+        return super().act(observation)
+
+
+class Middle:
+    """The blind guess: one lesion in the middle of the chart, regardless of the presses.
+
+    It presses the middle too, as the environment asks for presses; `estimate` and `estimate_map` are scored in place of
+    the estimator's output.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
+        """Begin an episode."""
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The middle of the chart."""
+        return np.zeros(2, dtype=np.float32)
+
+    def estimate(self, surface: Surface) -> NDArray[np.float64]:
+        """The middle of the chart on the surface [m], shape (1, 3)."""
+        return surface(np.zeros((1, 2)))
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """A uniform map without an outline."""
+        return replace(made, excess=np.zeros_like(made.excess), outline=np.zeros_like(made.outline))
+
+
+class TruthAgent(Middle):
+    """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %."""
+
+    sees_truth: ClassVar[bool] = True
+
+    def see(self, task: PalpateSitesTask) -> None:
+        """Take the truth of the episode that `reset` has begun."""
+        self.truth = task.truth
+
+    def estimate(self, surface: Surface) -> NDArray[np.float64]:
+        """Places of the lesions on the surface [m], shape (k, 3)."""
+        return self.truth
+
+    def estimate_map(self, made: MapScore) -> MapScore:
+        """The true map: 1 over lesions, else 0, and the true outline."""
+        return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
+
+
+# Sides of the rasters tried on each scene; the leaderboard shows the best raster.
+RASTER_SIDES = (2, 3, 4, 5, 6, 7)
+
+AGENTS: dict[str, Callable[[], SiteAgent]] = {
+    "random": RandomSites,
+    **{f"raster_{side}": lambda side=side: RasterSites(side) for side in RASTER_SIDES},
+    "sobol": SobolSites,
+    "gp_variance": GpVariance,
+    "gp_ucb": GpUcb,
+    "gp_level_set": GpLevelSet,
+    "oracle": OracleSites,
+    "oracle_near": OracleNear,
+    "truth": TruthAgent,
+    "middle": Middle,
+}
+
+# Methods whose estimates do not depend on what their presses feel.
+REFERENCES = ("truth", "middle")
+# Methods that know the truth, or do not search.
+BOUNDS = (*REFERENCES, "oracle", "oracle_near")

@@ -1,0 +1,262 @@
+"""A ball pressed into a bonded layer at finite strains: axisymmetric neo-Hookean finite elements of scikit-fem.
+
+The ball is rigid and frictionless; what holds the surface off it is a pressure per undeformed area, k_p times the
+penetration, as in the contact law of this package. With a large k_p this is a rigid ball without penetration.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+from msdm_core.mesh import FloatArray
+
+# Pressure per penetration that stands for a rigid ball [N/m^3]: 5 kPa make 5 um.
+RIGID = 1e9
+# Poisson's ratio of a membrane on the top.
+MEMBRANE_RATIO = 0.5
+# Largest step of the depth [m], Newton's tolerance on the residual over the ball's force, its most
+# iterations, how often its step is halved, and how many iterations may raise the residual.
+DEPTH_STEP = 2.5e-4
+TOLERANCE = 1e-6
+ITERATIONS = 60
+HALVINGS = 6
+WILD = 6
+
+Modulus = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def neo_hookean(gradient: NDArray, shear: NDArray, lame: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """First Piola stress [Pa], its slope [Pa] and J of W = mu (I1 - 3 - 2 ln J) / 2 + lambda (J - 1)^2 / 2.
+
+    Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 6.4.3, with (J - 1)^2 in place of
+    (ln J)^2, as the volume term of the organ has it. With G = J F^-T: P = mu (F - G / J) + lambda (J - 1) G.
+
+    Args:
+        gradient: F_rr, F_rz, F_zr, F_zz and the stretch around the axis (5, ...).
+        shear: mu [Pa] (...).
+        lame: lambda [Pa] (...).
+    """
+    rr, rz, zr, zz, hoop = gradient
+    flat = rr * zz - rz * zr
+    ratio = flat * hoop
+    cofactor = np.array([zz * hoop, -zr * hoop, -rz * hoop, rr * hoop, flat])
+    volume = lame * (ratio - 1.0) - shear / ratio
+    stress = shear * gradient + volume * cofactor
+    tangent = (lame + shear / ratio**2) * _outer(cofactor, cofactor)
+    for part in range(5):
+        tangent[part, part] += shear
+    # dG / dF: the second derivatives of J.
+    for one, other, slope in ((0, 3, hoop), (1, 2, -hoop), (0, 4, zz), (1, 4, -zr), (2, 4, -rz), (3, 4, rr)):
+        tangent[one, other] += volume * slope
+        tangent[other, one] += volume * slope
+    return stress, tangent, ratio
+
+
+def layer_mesh(radius: float, depth: float, fine: float, reach: tuple[float, float]) -> Any:
+    """Quadrilaterals of a disc r = 0 to radius, z = -depth to 0 [m], `fine` large within a reach (r, z), then wider."""
+    from skfem import MeshQuad
+
+    def line(length: float, near: float) -> FloatArray:
+        inner = np.linspace(0.0, near, round(near / fine) + 1)
+        widths = [fine]
+        while inner[-1] + sum(widths[1:]) < length:
+            widths.append(1.3 * widths[-1])
+        outer = inner[-1] + np.cumsum(widths[1:]) * (length - inner[-1]) / sum(widths[1:])
+        return np.concatenate([inner, outer])
+
+    return MeshQuad.init_tensor(line(radius, reach[0]), -line(depth, reach[1])[::-1])
+
+
+class PressedLayer:
+    """A bonded layer of modulus E(r, z) [Pa] under a ball, quadratic elements at finite strain."""
+
+    def __init__(self, mesh: Any, modulus: Modulus, poisson_ratio: float, *, membrane: float = 0.0) -> None:
+        """Make the layer at rest.
+
+        Args:
+            mesh: of `layer_mesh`.
+            modulus: Young's modulus at places (r, z) [Pa].
+            poisson_ratio: of all of it.
+            membrane: modulus times thickness of a membrane on its top [N/m].
+        """
+        from skfem import Basis, ElementQuad2, ElementVector, FacetBasis
+
+        self._basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=4)
+        self._top = FacetBasis(
+            mesh, self._basis.elem, facets=mesh.facets_satisfying(lambda x: np.abs(x[1]) < 1e-12), intorder=5
+        )
+        place, axis = self._basis.doflocs, np.zeros(self._basis.N, dtype=np.int64)
+        for dofs in (self._basis.nodal_dofs, self._basis.facet_dofs, self._basis.interior_dofs):
+            axis[np.asarray(dofs)[1::2]] = 1
+        self._up = axis == 1
+        held = ((place[0] < 1e-12) & ~self._up) | (place[1] <= place[1].min() + 1e-12)
+        self._free = np.flatnonzero(~held)
+        r, z = self._basis.global_coordinates()
+        shear = modulus(r, z) / (2.0 * (1.0 + poisson_ratio))
+        self._moduli = shear, 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
+        self._weight = 2.0 * np.pi * r * self._basis.dx
+        self._rates = _rates(self._basis, r)
+        self._top_rates = _rates(self._top, self._top.global_coordinates()[0])
+        self._membrane = membrane / (1.0 - MEMBRANE_RATIO**2)
+
+    def forces(self, radius: float, depths: Sequence[float], contact_stiffness: float = RIGID) -> list[float]:
+        """Force of the ball at each of some rising depths of its lowest point below the surface at rest [N].
+
+        Raises:
+            ValueError: Newton's method does not converge.
+        """
+        found = [
+            self._contact(one, radius, depth, contact_stiffness)[1][self._up].sum()
+            for depth, one in self._pressed(radius, depths, contact_stiffness)
+        ]
+        return [float(force) for force in found]
+
+    def load(self, radius: float, depth: float, contact_stiffness: float = RIGID) -> tuple[float, float]:
+        """Largest contact pressure per undeformed area [Pa] and largest |lambda - 1| of the principal stretches."""
+        ((_, u),) = self._pressed(radius, (depth,), contact_stiffness)
+        rr, rz, zr, zz, hoop = self._strained(u)
+        _, gap, _ = self._gaps(u, radius, depth)
+        across = np.linalg.svd(np.moveaxis(np.array([[rr, rz], [zr, zz]]), (0, 1), (-2, -1)), compute_uv=False)
+        stretches = np.concatenate([across.ravel(), hoop.ravel()])
+        return float(contact_stiffness * gap.max()), float(np.abs(stretches - 1.0).max())
+
+    def _pressed(
+        self, radius: float, depths: Sequence[float], contact_stiffness: float
+    ) -> Iterator[tuple[float, FloatArray]]:
+        """Each depth [m] with the displacement in equilibrium there [m]."""
+        displacement = np.zeros(self._basis.N)
+        reached, target = 0.0, 0.0
+        for depth in depths:
+            step = DEPTH_STEP
+            while reached < depth - 1e-12:
+                target = min(depth, reached + step)
+                after = self._balanced(displacement, radius, target, contact_stiffness)
+                if after is None:
+                    step *= 0.5
+                    if step < DEPTH_STEP / 2**HALVINGS:
+                        raise ValueError(f"the reference for the ball did not converge at {target * 1e3:.3g} mm")
+                    continue
+                displacement, reached = after, target
+            yield depth, displacement
+
+    def _balanced(self, start: FloatArray, radius: float, depth: float, stiffness: float) -> FloatArray | None:
+        """Displacement in equilibrium [m] from a start, by Newton's method; None where it does not converge."""
+        u, free = start.copy(), self._free
+        matrix, force, push = self._forces(u, radius, depth, stiffness)
+        for iteration in range(ITERATIONS):
+            residual = (force + push)[free]
+            size = float(np.abs(residual).sum())
+            if size <= TOLERANCE * float(np.abs(push).sum()):
+                return u
+            # Nearly symmetric as it is: an ordering for that takes a third of the time.
+            factors = splu(matrix[free][:, free].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            change = factors.solve(-residual)
+            # A long step may end in another equilibrium, with a crease in the surface.
+            share = min(1.0, DEPTH_STEP / float(np.abs(change).max()))
+            for _ in range(HALVINGS):
+                trial = u.copy()
+                trial[free] += share * change
+                if self._smallest_ratio(trial) > 0.0:
+                    matrix, force, push = self._forces(trial, radius, depth, stiffness)
+                    # The first steps may go uphill; later ones must not, or points go in and out of contact for ever.
+                    if iteration < WILD or float(np.abs((force + push)[free]).sum()) < size:
+                        break
+                share *= 0.5
+            else:
+                return None
+            u = trial
+        return None
+
+    def _forces(
+        self, u: FloatArray, radius: float, depth: float, stiffness: float
+    ) -> tuple[Any, FloatArray, FloatArray]:
+        """Tangent stiffness of solid and contact [N/m], and the forces of each [N], at a displacement."""
+        matrix, force = self._solid(u)
+        held, push = self._contact(u, radius, depth, stiffness)
+        return csc_array(matrix + held), force, push
+
+    def _smallest_ratio(self, u: FloatArray) -> float:
+        return float(neo_hookean(self._strained(u), *self._moduli)[2].min())
+
+    def _strained(self, u: FloatArray) -> NDArray:
+        """Deformation gradient of a displacement: F_rr, F_rz, F_zr, F_zz and the stretch around the axis (5, n, m)."""
+        return np.array([1.0, 0.0, 0.0, 1.0, 1.0])[:, None, None] + np.einsum(
+            "inea,ie->nea", self._rates[:, :5], u[self._basis.element_dofs], optimize=True
+        )
+
+    def _solid(self, u: FloatArray) -> tuple[Any, FloatArray]:
+        """Tangent stiffness [N/m] and forces of the solid and its membrane [N] at a displacement."""
+        stress, tangent, _ = neo_hookean(self._strained(u), *self._moduli)
+        matrix, vector = _assembled(self._basis, self._rates[:, :5], self._weight, stress, tangent)
+        if self._membrane > 0.0:
+            more, pull = self._skin(u)
+            matrix, vector = matrix + more, vector + pull
+        return matrix, vector
+
+    def _top_values(self, u: FloatArray) -> NDArray:
+        """Rates of a displacement on the top: d/dr and d/dz of both parts, u_r / r, u_r, u_z (7, n, m)."""
+        return np.einsum("inea,ie->nea", self._top_rates, u[self._top.element_dofs], optimize=True)
+
+    def _skin(self, u: FloatArray) -> tuple[Any, FloatArray]:
+        """Tangent stiffness and forces of the membrane: (C / 2) (e_r^2 + e_h^2 + 2 nu e_r e_h) per area, Green strains.
+
+        Plane stress, C = E h / (1 - nu^2).
+        """
+        size, ratio = self._membrane, MEMBRANE_RATIO
+        rates, r = self._top_values(u), self._top.global_coordinates()[0]
+        along, slope, hoop = 1.0 + rates[0], rates[2], 1.0 + rates[4]
+        strain, round_strain = 0.5 * (along**2 + slope**2 - 1.0), 0.5 * (hoop**2 - 1.0)
+        pull, round_pull = size * (strain + ratio * round_strain), size * (round_strain + ratio * strain)
+        first, second = np.array([along, slope, np.zeros_like(hoop)]), np.array([0.0 * hoop, 0.0 * hoop, hoop])
+        stress = pull * first + round_pull * second
+        tangent = size * (_outer(first, first) + _outer(second, second))
+        tangent += size * ratio * (_outer(first, second) + _outer(second, first))
+        for part, held in enumerate((pull, pull, round_pull)):
+            tangent[part, part] += held
+        weight = 2.0 * np.pi * r * self._top.dx
+        return _assembled(self._top, self._top_rates[:, (0, 2, 4)], weight, stress, tangent)
+
+    def _contact(self, u: FloatArray, radius: float, depth: float, stiffness: float) -> tuple[Any, FloatArray]:
+        """Tangent stiffness and forces [N] of a ball `depth` below the surface at rest, on the surface, outward."""
+        out, gap, distance = self._gaps(u, radius, depth)
+        across = np.eye(2)[:, :, None, None] - _outer(out, out)
+        tangent = stiffness * ((gap > 0.0) * _outer(out, out) - gap / distance * across)
+        weight = 2.0 * np.pi * self._top.global_coordinates()[0] * self._top.dx
+        return _assembled(self._top, self._top_rates[:, 5:], weight, -stiffness * gap * out, tangent)
+
+    def _gaps(self, u: FloatArray, radius: float, depth: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Direction from the ball's centre, penetration and distance [m] of points of the top."""
+        rates, (r, _) = self._top_values(u), self._top.global_coordinates()
+        place = np.array([r + rates[5], rates[6] - (radius - depth)])
+        distance = np.sqrt((place**2).sum(axis=0))
+        return place / distance, np.maximum(radius - distance, 0.0), distance
+
+
+def _outer(one: NDArray, other: NDArray) -> NDArray:
+    return one[:, None] * other[None]
+
+
+def _rates(basis: Any, r: NDArray) -> NDArray:
+    """Of each of an element's functions v: d/dr and d/dz of v_r and v_z, v_r / r, v_r, v_z (n_function, 7, n, m)."""
+    found = []
+    for (one,) in basis.basis:
+        value, gradient = np.broadcast_to(np.array(one), (2, *r.shape)), np.broadcast_to(one.grad, (2, 2, *r.shape))
+        found.append([*gradient.reshape(4, *r.shape), value[0] / r, *value])
+    return np.array(found)
+
+
+def _assembled(basis: Any, rates: NDArray, weight: NDArray, stress: NDArray, tangent: NDArray) -> tuple[Any, NDArray]:
+    """Matrix and vector of the sum over places of stress and tangent on the functions' rates (n_function, k, n, m)."""
+    vector, matrix = np.zeros(basis.N), 0.0
+    loaded = np.einsum("inea,nea,ea->ie", rates, stress, weight, optimize=True)
+    np.add.at(vector, basis.element_dofs, loaded)
+    stiff = np.einsum("nkea,jkea->jnea", tangent * weight, rates, optimize=True)
+    matrix = np.einsum("inea,jnea->ije", rates, stiff, optimize=True)
+    count = len(rates)
+    rows = np.repeat(basis.element_dofs[:, None], count, axis=1)
+    columns = np.repeat(basis.element_dofs[None], count, axis=0)
+    return csc_array((matrix.ravel(), (rows.ravel(), columns.ravel())), shape=(basis.N, basis.N)), vector

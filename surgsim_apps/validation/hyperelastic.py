@@ -1,0 +1,315 @@
+"""Blocks at finite strain: quadratic hexahedra of a hyperelastic solid, and the organ in static equilibrium.
+
+A block with faces square to the axes is pulled, compressed or sheared by its ends z = 0 and z = height. Ends are bonded
+to plates, or slide on them. The solids are those of `msdm_core.material.continuum`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import spsolve
+
+from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
+from msdm_core.material import STRAIN_LEAST, Stiffening
+from msdm_core.mesh import FloatArray, TetMesh
+from msdm_core.organ import node_strains, rest_state
+from surgsim_apps.validation.elements import Cells, Size
+from surgsim_apps.validation.statics import averaged_gradient, block_sum, node_rows, volume_gradient
+
+Test = Literal["pull", "slide", "shear"]
+# Forces balance to this share of the force on a plate.
+RESIDUAL = 1e-7
+STRAIN_STEP = 0.02
+ROUNDS, HALVINGS = 40, 8
+
+
+class SolidWithTangent(Protocol):
+    """A solid with the derivative of its stress."""
+
+    def first_piola(self, gradient: FloatArray) -> FloatArray:
+        """P [Pa], (..., 3, 3)."""
+        ...
+
+    def tangent(self, gradient: FloatArray) -> FloatArray:
+        """dP/dF [Pa], (..., 3, 3, 3, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Plates:
+    """Rows of a block's displacement that its plates hold, and their displacement per unit of the test.
+
+    Args:
+        held: rows (n,), three a node.
+        direction: displacement of these rows at unit strain [m], (n,).
+        loaded: rows whose forces sum to the force on the upper plate.
+    """
+
+    held: NDArray[np.int64]
+    direction: FloatArray
+    loaded: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, points: FloatArray, test: Test) -> "Plates":
+        """The plates of a block with nodes at `points` [m], (n_node, 3); strain is over its height.
+
+        "pull": bonded ends drawn apart. "slide": ends drawn apart, free to slide. "shear": bonded ends, the upper one
+        moved along x.
+        """
+        height = points[:, 2].max()
+        low, high = np.flatnonzero(points[:, 2] < 1e-9), np.flatnonzero(points[:, 2] > height - 1e-9)
+        ends = np.concatenate([low, high])
+        moved = np.repeat([0.0, height], [len(low), len(high)])
+        if test == "slide":
+            held, direction = 3 * ends + 2, moved
+            # The middle of the block's faces x = 0 and y = 0 slides in its plane: no drift, no turn, nothing bent.
+            middle = points.max(axis=0) / 2.0
+            for axis in (0, 1):
+                plane = np.flatnonzero(np.abs(points[:, axis] - middle[axis]) < 1e-9)
+                held = np.concatenate([held, 3 * plane + axis])
+                direction = np.concatenate([direction, np.zeros(len(plane))])
+            return cls(held, direction, 3 * high + 2)
+        axis = 2 if test == "pull" else 0
+        held = (3 * ends[:, None] + np.arange(3)).ravel()
+        direction = np.zeros((len(ends), 3))
+        direction[:, axis] = moved
+        return cls(held, direction.ravel(), 3 * high + axis)
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticBlock:
+    """The block [0, sx] x [0, sy] x [0, sz] of a solid in quadratic hexahedra at finite strain (total Lagrangian).
+
+    Args:
+        points: of the nodes [m], (n_node, 3).
+        rows: of each element's displacement, (n_element, 81).
+        slopes: d(grad u)/d(rows) at the quadrature points [1/m], (n_element, n_point, 81, 9).
+        weights: volumes of the quadrature points [m^3], (n_element, n_point).
+    """
+
+    points: FloatArray
+    rows: NDArray[np.int64]
+    slopes: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, size: Size, cells: Cells) -> "QuadraticBlock":
+        """The block with some elements along x, y and z."""
+        from skfem import Basis, ElementHex2, ElementVector, MeshHex
+
+        mesh = MeshHex.init_tensor(*(np.linspace(0.0, length, count + 1) for length, count in zip(size, cells)))
+        basis = Basis(mesh, ElementVector(ElementHex2()), intorder=5)
+        slopes = np.array([one[0].grad for one in basis.basis])
+        order, place = _rows_by_node(basis)
+        return cls(
+            place, order[basis.element_dofs.T],
+            np.ascontiguousarray(slopes.reshape(len(slopes), 9, *slopes.shape[3:]).transpose(2, 3, 0, 1)), basis.dx,
+        )  # fmt: skip
+
+    def response(self, solid: SolidWithTangent, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
+        """Forces of the solid on the plates and nodes [N], (3 n_node,), and their derivative [N/m]."""
+        count, points = self.weights.shape
+        gradient = np.eye(3) + np.einsum("epra,er->epa", self.slopes, displacement[self.rows], optimize=True).reshape(
+            count, points, 3, 3
+        )
+        stress = solid.first_piola(gradient).reshape(count, points, 9)
+        force = np.einsum("epra,epa->er", self.slopes, stress * self.weights[..., None], optimize=True)
+        tangent = solid.tangent(gradient).reshape(count, points, 9, 9) * self.weights[..., None, None]
+        blocks = (self.slopes @ tangent @ self.slopes.transpose(0, 1, 3, 2)).sum(axis=1)
+        return _assembled(force, blocks, self.rows, 3 * len(self.points))
+
+    def forces(self, solid: SolidWithTangent, test: Test, strains: tuple[float, ...]) -> list[float]:
+        """Force on the upper plate at strains that follow each other [N]."""
+        plates = Plates.of(self.points, test)
+        displacement = np.zeros(3 * len(self.points))
+        return _forces(lambda u: self.response(solid, u), plates, displacement, strains, test)
+
+
+def _rows_by_node(basis: Any) -> tuple[NDArray[np.int64], FloatArray]:
+    """New numbers of scikit-fem's rows, three a node, and the places of these nodes (n_node, 3)."""
+    order = np.empty(basis.N, dtype=np.int64)
+    places: list[FloatArray] = []
+    for dofs in (basis.nodal_dofs, basis.edge_dofs, basis.facet_dofs, basis.interior_dofs):
+        rows = np.asarray(dofs)
+        for first in range(0, len(rows), 3):
+            nodes = len(places) + np.arange(rows.shape[1])
+            places += list(basis.doflocs[:, rows[first]].T)
+            for axis in range(3):
+                order[rows[first + axis]] = 3 * nodes + axis
+    return order, np.array(places)
+
+
+def _assembled(
+    force: FloatArray, blocks: FloatArray, rows: NDArray[np.int64], count: int
+) -> tuple[FloatArray, csc_array]:
+    """Sums of element vectors (n, m) and matrices (n, m, m) at their rows (n, m)."""
+    total = np.bincount(rows.ravel(), force.ravel(), count).astype(np.float64)
+    return total, csc_array(block_sum(blocks, rows, count))
+
+
+def _forces(
+    response: Callable[[FloatArray], tuple[FloatArray, csc_array]],
+    plates: Plates,
+    displacement: FloatArray,
+    strains: tuple[float, ...],
+    name: str,
+) -> list[float]:
+    """Force on the loaded plate at strains that follow each other [N], reached by steps of at most STRAIN_STEP."""
+    before, found = 0.0, []
+    for strain in strains:
+        count = max(1, int(np.ceil(abs(strain - before) / STRAIN_STEP - 1e-9)))
+        steps = np.linspace(before, strain, count + 1)[1:]
+        found.append([_balanced(response, plates, displacement, float(one), f"{name} {one:g}") for one in steps][-1])
+        before = strain
+    return found
+
+
+def _balanced(
+    response: Callable[[FloatArray], tuple[FloatArray, csc_array]],
+    plates: Plates,
+    displacement: FloatArray,
+    strain: float,
+    name: str,
+) -> float:
+    """Bring a displacement in place to equilibrium between plates at a strain (Newton); returns the plate's force [N].
+
+    Raises:
+        ValueError: no equilibrium was found; names the test.
+    """
+    free = np.setdiff1d(np.arange(len(displacement)), plates.held)
+    force, stiffness = response(displacement)
+    # The plates move once, and everything follows as in a linear body.
+    change = strain * plates.direction - displacement[plates.held]
+    step = np.zeros_like(displacement)
+    step[plates.held] = change
+    step[free] = solved(stiffness, free, -force[free] - stiffness[free][:, plates.held] @ change)
+    displacement += step
+    for _ in range(ROUNDS):
+        force, stiffness = response(displacement)
+        size = float(np.linalg.norm(force[free]))
+        if size <= RESIDUAL * float(np.abs(force[plates.loaded]).sum()):
+            return float(force[plates.loaded].sum())
+        step = solved(stiffness, free, -force[free])
+        for share in 0.5 ** np.arange(HALVINGS):
+            displacement[free] += share * step
+            if float(np.linalg.norm(response(displacement)[0][free])) < size:
+                break
+            displacement[free] -= share * step
+        else:
+            break
+    raise ValueError(f"the block did not come to rest: {name}")
+
+
+def solved(stiffness: csc_array, free: NDArray[np.int64], right: FloatArray) -> FloatArray:
+    """Displacement of the free rows [m] under a load [N]."""
+    return np.asarray(spsolve(stiffness[free][:, free].tocsc(), right, permc_spec="MMD_AT_PLUS_A"))
+
+
+@dataclass(frozen=True, eq=False)
+class OrganBlock:
+    """A block as an organ: forces by its kernels, statics by Newton's method with springs and volume terms.
+
+    The matrix only leads to the equilibrium; what is in equilibrium are the forces of the kernels.
+
+    Args:
+        mesh: the block.
+        model: its organ, without anchors.
+        stiffening: of its springs, for the matrix.
+    """
+
+    mesh: TetMesh
+    model: OrganModel
+    stiffening: Stiffening | None = None
+
+    def forces(self, test: Test, strains: tuple[float, ...]) -> list[float]:
+        """Force on the upper plate at strains that follow each other [N]."""
+        plates, state = Plates.of(self.mesh.points, test), rest_state(self.model)
+        displacement = np.zeros(self.mesh.points.size)
+        return _forces(lambda u: self.response(state, u), plates, displacement, strains, f"organ, {test}")
+
+    def response(self, state: OrganState, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
+        """Minus the kernels' forces [N], (3 n_node,), and the matrix [N/m]."""
+        state.node_position[:] = self.model.node_rest_position + displacement.reshape(-1, 3)
+        state.node_velocity[:] = 0.0
+        evaluate_forces(self.model, state)
+        matrix = self._springs(state.node_position) + self._volumes(state.node_position)
+        return -state.node_force.ravel(), csc_array(matrix)
+
+    def _springs(self, position: FloatArray) -> csc_array:
+        """Tangent of the springs, (T / x) n n^T + (T / l) (1 - n n^T), x = l - l0, and what their ends add [N/m].
+
+        T = k x (1 + (r_a + r_b) / 2) with the rises r of both ends, of which r_a changes with all springs u of node a:
+        dr_a / dx_u = (dr_a / ds_a) q_a k_u x_u / s_a, where s_a^2 = q_a sum k x^2.
+        """
+        model, nodes = self.model, self.model.spring_nodes
+        span = position[nodes[:, 1]] - position[nodes[:, 0]]
+        length = np.linalg.norm(span, axis=1)
+        direction, change = span / length[:, None], length - model.spring_rest_length
+        stiffness = model.spring_stiffness
+        strain = rise = np.zeros(len(position))
+        if self.stiffening is not None:
+            strain = np.maximum(node_strains(model, length), STRAIN_LEAST)
+            rise = self.stiffening.tension(strain) / strain - 1.0
+            stiffness = stiffness * (1.0 + rise[nodes].mean(axis=1))
+        across = (stiffness * change / length)[:, None, None]
+        dyads = direction[:, :, None] * direction[:, None, :]
+        along = (stiffness[:, None, None] - across) * dyads + across * np.eye(3)
+        blocks = np.block([[along, -along], [-along, along]])
+        total = _assembled(np.zeros((len(nodes), 6)), blocks, node_rows(nodes), position.size)[1]
+        if self.stiffening is None:
+            return total
+        pull = (model.spring_stiffness * change)[:, None] * direction
+        values = np.concatenate([-pull, pull], axis=1)
+        sums = coo_array(
+            (np.tile(values.ravel(), 2), (np.repeat(nodes.T.ravel(), 6), np.tile(node_rows(nodes).ravel(), 2))),
+            shape=(len(position), position.size),
+        ).tocsr()
+        more = 0.5 * model.node_softness * (self.stiffening.tangent(strain) - 1.0 - rise) / strain**2
+        return csc_array(total + sums.T @ sums.multiply(more[:, None]).tocsr())
+
+    def _volumes(self, position: FloatArray) -> csc_array:
+        """Tangent of the volume terms, K / V0 dV dV^T + p d2V, p the tension of each tet and of its nodes [N/m]."""
+        model, count = self.model, position.size
+        gradient = volume_gradient(position, model.tet_nodes)
+        volume = (gradient * position[model.tet_nodes].reshape(-1, 12)).sum(axis=1) / 3.0
+        ratio = volume / model.tet_rest_volume
+        tension, slope = model.tet_bulk * (ratio - 1.0), model.tet_bulk.copy()
+        squeezed = ratio < SQUEEZED_RATIO
+        share = SQUEEZED_RATIO / ratio[squeezed]
+        tension[squeezed] += model.tet_averaged_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
+        slope[squeezed] += model.tet_averaged_bulk[squeezed] * share**2
+        if model.node_bulk.any():
+            node_volume = np.bincount(model.tet_nodes.ravel(), np.repeat(volume / 4.0, 4), len(position))
+            node_tension = model.node_bulk * (node_volume / model.node_rest_volume - 1.0)
+            tension = tension + node_tension[model.tet_nodes].mean(axis=1)
+        scale = slope / model.tet_rest_volume
+        blocks = scale[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+        blocks += tension[:, None, None] * _volume_curvature(position[model.tet_nodes])
+        rows = node_rows(model.tet_nodes)
+        total = _assembled(np.zeros(rows.shape), blocks, rows, count)[1]
+        if model.node_bulk.any():
+            averaged = averaged_gradient(model.tet_nodes, gradient, count)
+            weighted = averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
+            total = total + averaged.T @ weighted
+        return csc_array(total)
+
+
+def _volume_curvature(corners: FloatArray) -> FloatArray:
+    """d2V/dx dx of tets with corners (n, 4, 3) [m], (n, 12, 12).
+
+    6 V = b . (c x d) with edges from the first corner: d(6 V)/db dc = -[d], [d] x = d x x; the first corner's rows are
+    minus the sums of the others'.
+    """
+    b, c, d = (corners[:, one] - corners[:, 0] for one in (1, 2, 3))
+    found = np.zeros((len(corners), 4, 3, 4, 3))
+    for first, second, edge in ((1, 2, d), (2, 3, b), (3, 1, c)):
+        turn = np.cross(np.eye(3)[None], edge[:, None, :]) / 6.0
+        found[:, first, :, second, :] = turn.transpose(0, 2, 1)
+        found[:, second, :, first, :] = turn
+    found[:, 0] = -found[:, 1:].sum(axis=1)
+    found[:, :, :, 0] = -found[:, :, :, 1:].sum(axis=3)
+    return found.reshape(-1, 12, 12)

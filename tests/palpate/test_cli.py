@@ -1,0 +1,141 @@
+"""`surgsim` as a user meets it: what it writes, what it says, and one line for bad input."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from surgsim_apps.cli.main import main
+from surgsim_apps.palpate.job import COLUMNS
+from surgsim_env.palpation.site_press import scan
+from surgsim_env.scene.anatomy import load_anatomy
+from surgsim_env.scene.load import make_scene
+
+COARSE = ["palpate", "--scene", "phantom", "--spacing", "0.008"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A coarse palpation of the phantom: folder and what it printed."""
+    folder = tmp_path_factory.mktemp("runs") / "deep" / "phantom"
+    assert main([*COARSE, "--out", str(folder), "--seed", "7"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rows(run):
+    with (run / "palpation.csv").open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def summary(run):
+    return json.loads((run / "summary.json").read_text(encoding="utf-8"))
+
+
+def test_files(run, rows):
+    assert {path.name for path in run.iterdir()} == {"palpation.csv", "summary.json", "stiffness_map.png"}
+    assert tuple(rows[0]) == COLUMNS
+    picture = imread(run / "stiffness_map.png")
+    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
+
+
+def test_table_agrees_with_itself(rows):
+    assert [int(row["site"]) for row in rows] == list(range(len(rows)))
+    assert len(rows) == 16
+    for row in rows:
+        assert float(row["z"]) == pytest.approx(0.03, abs=1e-6)
+        assert np.hypot(float(row["normal_x"]), float(row["normal_y"])) < 1e-6
+        assert float(row["depth"]) == pytest.approx(0.004, abs=2e-4)
+        assert float(row["stiffness"]) == pytest.approx(float(row["reading"]) / float(row["depth"]), rel=1e-4)
+        assert abs(float(row["reading"]) - float(row["force"])) < 0.05
+        assert row["ended_early"] == ""
+        assert float(row["contrast_neighbours"]) > 0.5
+
+
+def test_summary_agrees_with_the_table(rows, summary):
+    assert summary["seed"] == 7
+    assert summary["inputs"]["scene"] == "phantom"
+    assert summary["sites"]["pressed"] == summary["sites"]["in_maps"] == len(rows)
+    assert summary["force_peak_N"] >= max(float(row["force"]) for row in rows)
+    assert 0.0 < summary["volume_ratio_smallest"] < 1.0
+    assert summary["real_time_factor"] == pytest.approx(summary["simulated_time_s"] / summary["wall_time_s"], rel=1e-3)
+    assert summary["simulated_time_s"] == pytest.approx(2 * len(rows) * 0.225, rel=0.01)
+    assert abs(summary["model"]["modulus_factor"] - 1.0) <= 0.2
+    assert summary["model"]["modulus_factor"] != 1.0
+    assert set(summary["maps"]) == {"healthy neighbours", "pre-operative model"}
+
+
+def test_summary_gives_the_truth_and_the_error(summary):
+    (truth,) = summary["truth"]
+    assert truth["surface_point_m"] == pytest.approx([0.036, 0.026, 0.03], abs=1e-6)
+    assert truth["centre_m"] == pytest.approx([0.036, 0.026, 0.018], abs=1e-6)
+    entry = summary["maps"]["pre-operative model"]
+    (lesion,) = entry["lesions"]
+    assert lesion["felt"]
+    assert entry["felt"] == 1
+    assert entry["false_alarms"] == 0
+    place = np.array(entry["estimates"][lesion["estimate"]]["point_m"])
+    assert lesion["error_mm"] == pytest.approx(1e3 * np.linalg.norm(place - truth["surface_point_m"]), abs=0.1)
+    assert lesion["error_mm"] < 8.0
+    assert lesion["contrast"] > 1.0 + 4.0 * entry["healthy_std"]
+
+
+def test_the_lesion_raises_the_stiffness_above_it(rows):
+    sites = np.array([[float(row[key]) for key in "xy"] for row in rows])
+    stiffest = sites[np.argmax([float(row["contrast_model"]) for row in rows])]
+    assert np.linalg.norm(stiffest - [0.036, 0.026]) < 0.008
+
+
+def test_interrupt(monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surgsim_apps.cli.scenes.list_scenes", stop)
+    assert main(["scenes"]) == 130
+    assert capsys.readouterr().err == "surgsim: stopped\n"
+
+
+def test_an_interrupt_during_a_scan_ends_after_the_press_at_hand(monkeypatch):
+    monkeypatch.setattr("surgsim_env.palpation.site_press.core_count", lambda: 2)
+    anatomy = load_anatomy(make_scene("phantom"))
+    sites, normals = anatomy.face.raster(0.01)
+    pressed = []
+
+    def stop() -> None:
+        pressed.append(1)
+        if len(pressed) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scan(anatomy, anatomy.organ(), sites, normals, progress=stop)
+    assert len(sites) > 8
+    assert len(pressed) <= 4  # the two that were at hand when it came
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["palpate", "--scene", "fantom"], "'phantom'"),
+        ([*COARSE, "--seed", "-1"], "-1"),
+        ([*COARSE, "--lesion", "0.03,0.03,0.015,0.008,-8"], "-8"),
+        ([*COARSE, "--lesion", "0.03,0.03,0.025,0.008,8"], "30.0, 30.0, 30.0 mm"),
+        ([*COARSE, "--lesion-below", "99,0.015,0.008,8"], "0 to 15"),
+        ([*COARSE, "--lesion-below", "3,0.007,0.008,8"], "depth"),
+        ([*COARSE, "--approach", "down"], "down"),
+        ([*COARSE, "--spacing", "nan"], "nan"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_2(arguments, named, capsys):
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("surgsim: error: ") and said.count("\n") == 1, said
+    assert named in said
+
+
+@pytest.mark.parametrize(("arguments", "named"), [(["palpat"], "palpat"), (["palpate", "--sceen", "liver"], "--sceen")])
+def test_an_unknown_option_is_named(arguments, named, capsys):
+    assert main(arguments) == 2
+    assert named in capsys.readouterr().err

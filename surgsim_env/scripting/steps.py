@@ -393,11 +393,12 @@ class AwaitEnd(_Checked):
 class Control(_Checked):
     """Let a controller of your own act, until `until(view)` is true or the episode ends; fails after `timeout` [s].
 
-    The controller is called with each observation and returns the action; if it has a `reset`, that is called first.
+    The controller is called with each observation and returns the action, or a dictionary of commands in SI units, by
+    name; if it has a `reset`, that is called first.
     Without `until` it acts for `timeout`, which is then no failure.
     """
 
-    controller: Callable[[np.ndarray], Action] = field(repr=False)
+    controller: Callable[[np.ndarray], Action | dict[str, Any]] = field(repr=False)
     timeout: float
     until: Predicate | None = field(default=None, repr=False)
     name: str = ""
@@ -409,7 +410,8 @@ class Control(_Checked):
         if reset is not None:
             reset()
         while not (_over(view, self.timeout) if self.until is None else self.until(view)):
-            view = yield np.asarray(self.controller(copy.deepcopy(view.observation)))
+            acted = self.controller(copy.deepcopy(view.observation))
+            view = yield view.layout.action(**acted) if isinstance(acted, dict) else np.asarray(acted)
 
 
 def _over(view: View, duration: float) -> bool:

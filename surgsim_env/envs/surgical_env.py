@@ -1,8 +1,8 @@
 """The Gymnasium environment: it puts a simulation and a task together and computes no physics and no reward itself."""
 
-import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.simulation import check_entries
+from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.envs.saved_state import pack_state, restore_state, state_maker
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
-from surgsim_env.scene.digest import scene_digest
 from surgsim_env.scene.load import fill
 from surgsim_env.tasks.declaration import ControlStep, documentation, reward_weights
 from surgsim_env.tasks.runtime import make_runtime, setting_names
@@ -33,8 +33,6 @@ ACTION_SLACK = 1e-6
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
-# Version of the format of saved states.
-STATE_VERSION = 1
 
 
 class SurgicalEnv(gym.Env[Observation, Action]):
@@ -170,40 +168,79 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._show()
         return self._observed(), info
 
-    def command(self, action: Action) -> None:
-        """Check an action and give the commands that it holds; the first part of `step`, which repeats it.
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+        """One control step: haptic steps until it is over, a force limit is passed or the simulation faults.
 
         Raises:
             ResetNeeded: no episode is running.
             ValueError: names the entry of the action that is out of bounds.
         """
-        if not self._running:
-            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
-        values = self._checked(action)
-        if not self.simulation.taken_over:
-            self.task.command(self.layout.commands(values), self.simulation.instrument)
+        self.begin(self.checked(action))
+        self.advance([self])
+        return self.finish()
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
-        """One control step: haptic steps until it is over, a force limit is passed or the simulation faults."""
-        self.command(action)
-        self.last_action = self._checked(action)
-        self.task.step_count += 1
-        force_peak = self._advance()
+    def checked(self, action: Action | FloatArray, lane: int | None = None) -> FloatArray:
+        """An action (n_action,) for `begin`; the lane of a vector environment is named in refusals.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: names the entry of the action that is out of bounds.
+        """
+        place, wrapper = ("", "ClipAction") if lane is None else (f"lane {lane}: ", "vector.ClipAction")
+        if not self._running:
+            raise gym.error.ResetNeeded(f"{place}the episode is over or has not begun: call reset()")
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"{place}action has shape {values.shape}; the rule is {self.action_space.shape}")
+        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
+        if bad.size:
+            raise ValueError(
+                f"{place}action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
+                f"wrap the environment in gymnasium.wrappers.{wrapper}"
+            )
+        return values
+
+    def begin(self, action: FloatArray) -> None:
+        """Command a `checked` action (n_action,): the first part of `step`."""
+        self.last_action = action
+        self.runtime.begin(action, self.simulation.instrument)
+
+    def advance(self, group: Sequence[Any], lanes: LaneGroup | None = None) -> None:
+        """Advance the simulations of a group by what a step lasts: the second part of `step`, once for the group.
+
+        Args:
+            group: environments that have begun the step, this one among them.
+            lanes: has their simulations; None for this one alone.
+        """
+        count = self.scene.timing.haptic_steps_per_control
+        limits = (self.runtime.force_limit, self.runtime.pull_limit)
+        if lanes is None:
+            self.simulation.control_step(count, *limits)
+        else:
+            lanes.control_step([env.simulation for env in group], count, *limits)
+
+    def finish(self) -> tuple[Observation, float, bool, bool, Info]:
+        """Observe and judge the step: its last part, whose result is that of `step`."""
         fault = self.simulation.fault
         saturated = False
         if not fault:
             self.simulation.end_control_step()
-            values, saturated = self.runtime.observe(ControlStep(self.simulation, force_peak), self.np_random)
+            values, saturated = self.runtime.observe(ControlStep(self.simulation, self.force_peak), self.np_random)
             fault = self.simulation.fault or self._out_of_bounds(values)
             if not fault:
                 self._take(values)
-        verdict = self.runtime.judge(ControlStep(self.simulation, force_peak, fault))
+        verdict = self.runtime.judge(ControlStep(self.simulation, self.force_peak, fault))
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
         self._show()
         # Not `sum`, which rounds once from Python 3.12 on and at each term before.
         reward = math.fsum(verdict.rewards.values())
         return self._observed(), reward, verdict.terminated, verdict.truncated, info
+
+    @property
+    def force_peak(self) -> float:
+        """Largest contact force of the last step [N]."""
+        return self.simulation.force_peak
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The picture of this moment in mode "rgb_array", shape (height, width, 3); a window shows each step by itself.
@@ -276,20 +313,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         """
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
-        arrays = self.simulation.get_state()
-        arrays["made_by"] = np.array(self._maker())
-        arrays["task"] = np.array(self.runtime.get_state())
-        arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
-        arrays["observation"] = self._observation.copy()
-        arrays["running"] = np.array(self._running)
-        if self._look is not None:
-            arrays["look"] = np.array(json.dumps(asdict(self._look)))
-            arrays["look_random"] = np.array(json.dumps(self._look_random.bit_generator.state))
-        if self.runtime.family is not None:
-            arrays["member"] = np.array(str(self.task.anatomy.member))
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        return buffer.getvalue()
+        return pack_state(self._maker(), self.simulation, self.runtime, self._own_state())
 
     def load_state(self, state: bytes) -> None:
         """Restore a state from `save_state`, to the bit, in this or another environment of the same scene.
@@ -300,25 +324,29 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             ValueError: bytes that are no saved state, or one of another scene, mesh or version (names both); names the
                 entry that is missing, unknown or of another shape.
         """
-        arrays = _unpacked(state, made_by=self._maker())
-        names = ["made_by", "task", "random", "running", "observation"]
-        names += ["member"] if self.runtime.family is not None else []
-        names += ["look", "look_random"] if self._look_ranges is not None else []
-        own = {name: arrays.pop(name) for name in names if name in arrays}
-        check_entries(own, {**dict.fromkeys(names, np.array("")), "observation": self._observation})
-        text, anatomy = str(own["task"]), self.task.anatomy
-        if self.runtime.family is not None:
-            anatomy = self.runtime.family.named(str(own["member"]))
-        # The first change, which leaves all as it is if it is refused.
-        self.simulation.set_state(self.runtime.saved_organ(text, anatomy), arrays)
-        self.runtime.set_state(text, anatomy)
-        self.simulation.take_anatomy(anatomy)
+        own = restore_state(state, self._maker(), self.simulation, self.runtime, self._own_state())
         self.np_random.bit_generator.state = json.loads(str(own["random"]))
         if self._look_ranges is not None:
             self._look = fill(Look, json.loads(str(own["look"])), "look")
             self._look_random.bit_generator.state = json.loads(str(own["look_random"]))
         self._take(own["observation"])
         self._begun, self._running = True, bool(own["running"])
+
+    def _own_state(self) -> dict[str, np.ndarray]:
+        """What a saved state holds beside simulation and task, by name."""
+        arrays = {
+            "random": np.array(json.dumps(self.np_random.bit_generator.state)),
+            "observation": self._observation.copy(),
+            "running": np.array(self._running),
+        }
+        if self._look_ranges is not None:
+            look = None if self._look is None else asdict(self._look)
+            arrays["look"] = np.array(json.dumps(look))
+            arrays["look_random"] = np.array(json.dumps(self._look_random.bit_generator.state))
+        return arrays
+
+    def _maker(self) -> str:
+        return state_maker(type(self).__name__, self.scene, self._mesh)
 
     def _draw_look(self, seed: int | None) -> None:
         """Draw the look of the next episode; a seed begins the random numbers of looks anew."""
@@ -334,11 +362,6 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _draw(self) -> None:
         """Draw an episode."""
         self.runtime.reset(self.simulation, self.np_random)
-
-    def _advance(self) -> float:
-        """Advance the simulation by what a step lasts; returns the largest contact force [N]."""
-        count = self.scene.timing.haptic_steps_per_control
-        return self.simulation.control_step(count, self.runtime.force_limit, self.runtime.pull_limit)
 
     def _take(self, values: NDArray[np.floating]) -> None:
         """Take the task's numbers as the last observation; its picture is of this moment too."""
@@ -381,28 +404,6 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if self.render_mode == "human":
             self._view.show(self._shown())
 
-    def _maker(self) -> str:
-        """What a saved state must agree with: the kind of environment, its scene and mesh, the rates, the version."""
-        scene, mesh = self.scene, self._mesh
-        digest = scene_digest(scene, mesh, size=4)
-        return (
-            f"{type(self).__name__} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest}), "
-            f"version {STATE_VERSION}"
-        )
-
-    def _checked(self, action: Action | FloatArray) -> FloatArray:
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != self.action_space.shape:
-            raise ValueError(f"action has shape {values.shape}; the rule is {self.action_space.shape}")
-        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
-        if bad.size:
-            raise ValueError(
-                f"action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
-                "wrap the environment in gymnasium.wrappers.ClipAction"
-            )
-        return values
-
     def _out_of_bounds(self, values: FloatArray) -> str:
         single = values.astype(np.float32)
         bad = np.flatnonzero(~((single >= self._low) & (single <= self._high)))
@@ -427,21 +428,3 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }
-
-
-def _unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
-    """The arrays of a saved state, whose entry `made_by` must be this one.
-
-    Raises:
-        ValueError: bytes that are no saved state, or one that another environment made (names both).
-    """
-    try:
-        with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-            arrays = dict(archive)
-        maker = str(arrays["made_by"])
-    except Exception as error:
-        # Damaged bytes raise any of a dozen kinds in zipfile and numpy, from KeyError to NotImplementedError.
-        raise ValueError(f"not a saved state, as save_state gives it ({type(error).__name__}: {error})") from None
-    if maker != made_by:
-        raise ValueError(f"the state was saved by {maker}, this is {made_by}: use the same scene")
-    return arrays

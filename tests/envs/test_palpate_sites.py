@@ -240,7 +240,7 @@ def test_a_press_that_was_begun_is_forgotten_with_its_episode():
     saved = env.save_state()
     expected = env.step(MIDDLE)
     for forget in (lambda: env.reset(seed=9), lambda: env.load_state(saved)):
-        env.begin_press(np.ones(2, dtype=np.float32))
+        env.begin(np.ones(2))
         forget()
         found = env.step(MIDDLE)
         np.testing.assert_array_equal(found[0], expected[0])

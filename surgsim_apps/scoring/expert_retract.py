@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import arctan2, norm
-from surgsim_env.tasks import RetractTask
+from surgsim_env.tasks import RetractTask, channel_slices
 
 SPEED = 0.02  # [m/s] full scale of an action's velocity
 TURNING = 0.5  # [rad/s] full scale of the wrist
 CONTROL_STEP = 0.05  # [s]
 
 # Entries of the observation, of an instrument with one hinge: channels of numbers and vectors, then single numbers.
-SLICES = RetractTask.channel_slices(tip_axes=6)
+SLICES = channel_slices(RetractTask, tip_axes=6)
 TIP, EDGE, TARGET = (SLICES[name] for name in ("tip_position", "edge_points", "target_place"))
 POINTS_ALONG = slice(SLICES["tip_axes"].start + 3, SLICES["tip_axes"].stop)
 GAP, GRIP, PULL, HOLDS, VISIBLE = (

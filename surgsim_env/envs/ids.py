@@ -38,7 +38,7 @@ class BimanualRetractEnv(SurgicalEnv):
     task: BimanualRetractTask
 
 
-def register_task(id: str, task_class: type[Task]) -> None:
+def register_task(id: str, task_class: type[Task], *, lanes: bool = True) -> None:
     """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
 
     The environment takes the arguments of `SurgicalEnv` and the task's own. Registering an id again replaces it, so
@@ -47,14 +47,15 @@ def register_task(id: str, task_class: type[Task]) -> None:
     Args:
         id: "Namespace/Name-v0".
         task_class: declares channels and rewards (`surgsim_env.Task`).
+        lanes: whether its instrument can act in many environments side by side: one arm can, a pair cannot.
     """
     TASKS[id] = task_class
     gym.registry.pop(id, None)
     gym.register(
         id=id,
         entry_point=f"surgsim_env.envs.ids:{id}",
-        vector_entry_point=f"surgsim_env.envs.vector_env:{id}" if task_class.lanes else None,
-        max_episode_steps=task_class.episode_steps,
+        vector_entry_point=f"surgsim_env.envs.vector_env:{id}" if lanes else None,
+        max_episode_steps=task_class.setup.episode_steps,
     )
 
 
@@ -80,5 +81,5 @@ def register() -> None:
     """Register the shipped ids with Gymnasium; importing `surgsim_env` does it."""
     register_task("SurgSim/Palpate-v0", PalpateTask)
     register_task("SurgSim/Retract-v0", RetractTask)
-    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask)
+    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask, lanes=False)
     register_task("SurgSim/PalpateSites-v0", PalpateSitesTask)

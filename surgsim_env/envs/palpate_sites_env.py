@@ -40,7 +40,8 @@ class PalpateSitesEnv(SurgicalEnv):
     def finish(self) -> tuple[Observation, float, bool, bool, Info]:
         """Observe and judge the press."""
         assert self._press is not None
-        self.task.take(self._site, self._press.result())
+        fault = self.simulation.fault
+        self._saturated = not fault and self.task.take(self._site, self._press.result(), self.np_random)
         return super().finish()
 
     @property
@@ -49,10 +50,14 @@ class PalpateSitesEnv(SurgicalEnv):
         return 0.0 if self._press is None else self._press.force_peak
 
     def _draw(self) -> None:
-        self._press = None
+        self._press, self._saturated = None, False
         super()._draw()
+
+    def _maker(self) -> str:
+        """As `SurgicalEnv._maker`, and the budget, on which observations and rewards depend."""
+        return f"{super()._maker()}, budget={self.task.given_budget}"
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
         """Of the whole press, where a simulation says only whether the instrument is limited at its end."""
         limited = self._press is not None and self._press.result().workspace_limited
-        return {**super()._info(fault, saturated, task_info, rewards), "workspace_limited": limited}
+        return {**super()._info(fault, self._saturated, task_info, rewards), "workspace_limited": limited}

@@ -9,7 +9,7 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from surgsim_env.coupling.simulation import Simulation, check_entries
 from surgsim_env.scene.digest import scene_digest
 from surgsim_env.scene.model import Scene
-from surgsim_env.tasks.task import Task
+from surgsim_env.tasks.runtime import TaskRuntime
 
 # Version of the format.
 STATE_VERSION = 1
@@ -24,18 +24,18 @@ def state_maker(kind: str, scene: Scene, mesh: TetMesh) -> str:
     )
 
 
-def pack_state(maker: str, simulation: Simulation, task: Task, own: Mapping[str, np.ndarray]) -> bytes:
+def pack_state(maker: str, simulation: Simulation, runtime: TaskRuntime, own: Mapping[str, np.ndarray]) -> bytes:
     """The state of a simulation and its task, with an environment's own arrays."""
-    arrays = {**simulation.get_state(), "made_by": np.array(maker), "task": np.array(task.get_state()), **own}
-    if task.family is not None:
-        arrays["member"] = np.array(str(task.anatomy.member))
+    arrays = {**simulation.get_state(), "made_by": np.array(maker), "task": np.array(runtime.get_state()), **own}
+    if runtime.family is not None:
+        arrays["member"] = np.array(str(runtime.task.anatomy.member))
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
 def restore_state(
-    state: bytes, maker: str, simulation: Simulation, task: Task, own: Mapping[str, np.ndarray]
+    state: bytes, maker: str, simulation: Simulation, runtime: TaskRuntime, own: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Restore a simulation and its task from `pack_state`, to the bit, and return the environment's own arrays.
 
@@ -45,7 +45,7 @@ def restore_state(
         state: the bytes.
         maker: of the environment that they go to.
         simulation: of that environment.
-        task: of that environment.
+        runtime: of that environment.
         own: examples of the environment's own arrays.
 
     Raises:
@@ -54,15 +54,15 @@ def restore_state(
     """
     arrays = _unpacked(state, maker)
     like = {**own, "made_by": np.array(""), "task": np.array("")}
-    if task.family is not None:
+    if runtime.family is not None:
         like["member"] = np.array("")
     given = {name: arrays.pop(name) for name in like if name in arrays}
     check_entries(given, like)
     text = str(given["task"])
-    anatomy = task.anatomy if task.family is None else task.family.named(str(given["member"]))
+    anatomy = runtime.task.anatomy if runtime.family is None else runtime.family.named(str(given["member"]))
     # The first change, which leaves all as it is if it is refused.
-    simulation.set_state(task.saved_organ(text, anatomy), arrays)
-    task.set_state(text, anatomy)
+    simulation.set_state(runtime.saved_organ(text, anatomy), arrays)
+    runtime.set_state(text, anatomy)
     simulation.take_anatomy(anatomy)
     return given
 

@@ -16,7 +16,8 @@ from surgsim_env.envs.saved_state import pack_state, restore_state, state_maker
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
 from surgsim_env.scene.load import fill
-from surgsim_env.tasks.declaration import documentation
+from surgsim_env.tasks.declaration import ControlStep, documentation, reward_weights
+from surgsim_env.tasks.runtime import make_runtime, setting_names
 from surgsim_env.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -29,8 +30,6 @@ Info = dict[str, Any]
 
 # How far an action may leave [-1, 1] by rounding.
 ACTION_SLACK = 1e-6
-# Draws of an episode until the task has to accept one.
-DRAWS_MOST = 20
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
@@ -80,22 +79,18 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if obs_mode not in OBSERVATION_MODES:
             raise ValueError(f"obs_mode {obs_mode!r} is unknown; the modes are {', '.join(OBSERVATION_MODES)}")
         kind = self.task_class
-        own = {name: settings.pop(name) for name in kind.setting_names() & set(settings)}
-        simulation, task = kind.make(
-            kind.default_scene if scene is None else scene,
-            kind.default_instrument if instrument is None else instrument,
-            **own,
-        )
+        own = {name: settings.pop(name) for name in setting_names(kind) & set(settings)}
+        simulation, self.runtime = make_runtime(kind, scene, instrument, **own)
         self.scene, self._mesh = simulation.anatomy.scene, simulation.anatomy.mesh
         self.simulation = simulation
         self._view = EpisodeView(self.simulation, render_mode, settings)
         self.render_mode = render_mode
         # The modes that this machine offers; the class names all that there are.
         self.metadata = self._view.metadata()  # type: ignore[misc]
-        self.task = task
-        self._low, self._high = (side.astype(np.float32) for side in task.bounds(self.simulation.instrument))
+        self.task, self.layout = self.runtime.task, self.runtime.layout
+        self._low, self._high = (side.astype(np.float32) for side in self.layout.bounds(simulation.instrument))
         # An observation is (task observation - origin) / scale.
-        origin, scale = task.scales(self.simulation.instrument)
+        origin, scale = self.layout.scales(simulation.instrument)
         self.scaled = scaled
         self._origin, self._scale = (origin, scale) if scaled else (np.zeros_like(origin), np.ones_like(scale))
         self._eye: EpisodeView | None = None
@@ -108,19 +103,19 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
         low, high = self.as_observed(self._low), self.as_observed(self._high)
         if obs_mode == "rgb_force":
-            self._felt = task.force_entries
+            self._felt = self.layout.force_entries
             if not self._felt:
                 raise ValueError(
-                    f'obs_mode is "rgb_force", and {type(task).__name__} has no channel that depends on force sensing: '
+                    f'obs_mode is "rgb_force", and {kind.__name__} has no channel that depends on force sensing: '
                     'mark one as felt, or observe "rgb"'
                 )
             force = gym.spaces.Box(low[self._felt], high[self._felt], dtype=np.float32)
             self.observation_space = gym.spaces.Dict({"picture": self.observation_space, "force": force})
         elif obs_mode == "state":
             self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.layout.action_size,), dtype=np.float32)
         self._observation = np.zeros(self._low.shape, dtype=np.float32)
-        self._unobserved = [] if observe_force else task.force_entries
+        self._unobserved = [] if observe_force else self.layout.force_entries
         # The eye's picture of the last observation; None until it is drawn.
         self._picture: NDArray[np.uint8] | None = None
         self._look_ranges: LookRanges | None = None
@@ -129,7 +124,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if looks is not None:
             self.take_looks(looks)
         # The action of the last step, after wrappers changed it.
-        self.last_action = np.zeros(task.action_size)
+        self.last_action = np.zeros(self.layout.action_size)
         self._begun = False
         self._running = False
 
@@ -161,7 +156,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
         self._draw_look(seed)
         self._draw()
-        values, saturated = self.task.observe(self.simulation, self.np_random)
+        values, saturated = self.runtime.observe(ControlStep(self.simulation), self.np_random)
         if wrong := self._out_of_bounds(values):
             raise ValueError(
                 f"{type(self.task).__name__}, after a reset: {wrong}; a channel's read must stay within its low and "
@@ -169,8 +164,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             )
         self._take(values)
         self._begun = self._running = True
-        own = self.task.info(None, "") | self.task.tissue_info(None, "")
-        info = self._info("", saturated, own, dict.fromkeys(self.task.weights, 0.0))
+        info = self._info("", saturated, self.runtime.first_info(), dict.fromkeys(reward_weights(self.task), 0.0))
         self._show()
         return self._observed(), info
 
@@ -209,8 +203,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def begin(self, action: FloatArray) -> None:
         """Command a `checked` action (n_action,): the first part of `step`."""
         self.last_action = action
-        self.task.command(action, self.simulation.instrument)
-        self.task.begin(action)
+        self.runtime.begin(action, self.simulation.instrument)
 
     def advance(self, group: Sequence[Any], lanes: LaneGroup | None = None) -> None:
         """Advance the simulations of a group by what a step lasts: the second part of `step`, once for the group.
@@ -219,8 +212,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             group: environments that have begun the step, this one among them.
             lanes: has their simulations; None for this one alone.
         """
-        timing, task = self.scene.timing, self.task
-        count, limits = timing.haptic_steps_per_control, (task.force_limit, task.pull_limit)
+        count = self.scene.timing.haptic_steps_per_control
+        limits = (self.runtime.force_limit, self.runtime.pull_limit)
         if lanes is None:
             self.simulation.control_step(count, *limits)
         else:
@@ -232,11 +225,11 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         saturated = False
         if not fault:
             self.simulation.end_control_step()
-            values, saturated = self.task.observe(self.simulation, self.np_random)
+            values, saturated = self.runtime.observe(ControlStep(self.simulation, self.force_peak), self.np_random)
             fault = self.simulation.fault or self._out_of_bounds(values)
             if not fault:
                 self._take(values)
-        verdict = self.task.judge(self.simulation, self.force_peak, fault)
+        verdict = self.runtime.judge(ControlStep(self.simulation, self.force_peak, fault))
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
         self._show()
@@ -279,7 +272,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     @property
     def observation_slices(self) -> dict[str, slice]:
         """The entries of an observation that each channel has: `observation[observation_slices["contact_force"]]`."""
-        return dict(self.task.observation_slices)
+        return dict(self.layout.observation_slices)
 
     @property
     def observation(self) -> Observation:
@@ -320,7 +313,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         """
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
-        return pack_state(self._maker(), self.simulation, self.task, self._own_state())
+        return pack_state(self._maker(), self.simulation, self.runtime, self._own_state())
 
     def load_state(self, state: bytes) -> None:
         """Restore a state from `save_state`, to the bit, in this or another environment of the same scene.
@@ -331,7 +324,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             ValueError: bytes that are no saved state, or one of another scene, mesh or version (names both); names the
                 entry that is missing, unknown or of another shape.
         """
-        own = restore_state(state, self._maker(), self.simulation, self.task, self._own_state())
+        own = restore_state(state, self._maker(), self.simulation, self.runtime, self._own_state())
         self.np_random.bit_generator.state = json.loads(str(own["random"]))
         if self._look_ranges is not None:
             self._look = fill(Look, json.loads(str(own["look"])), "look")
@@ -367,20 +360,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._look = draw_look(ranges, self._look_random)
 
     def _draw(self) -> None:
-        """Draw episodes until the task accepts one."""
-        for _ in range(DRAWS_MOST):
-            if self.task.family is not None:
-                self.task.take_anatomy(self.task.family.draw(self.np_random))
-                self.simulation.take_anatomy(self.task.anatomy)
-            start = self.task.reset(self.np_random)
-            self.simulation.reset(start.organ, start.tip_position)
-            self.simulation.draw_motion(self.np_random)
-            if self.task.accepts(self.simulation):
-                return
-        raise ValueError(
-            f"scene {self.scene.name!r}: none of {DRAWS_MOST} draws is an episode that the task accepts: "
-            "narrow the ranges of the scene's draw"
-        )
+        """Draw an episode."""
+        self.runtime.reset(self.simulation, self.np_random)
 
     def _take(self, values: NDArray[np.floating]) -> None:
         """Take the task's numbers as the last observation; its picture is of this moment too."""
@@ -415,9 +396,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _shown(self) -> Shown:
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
-        target = self.task.target
+        target, endoscope = self.task.pictured.target, self.task.pictured.endoscope
         moved = None if target is None else target.moved(self.simulation.ground_shift(target.centre))
-        return Shown(self.task.lesions, moved, self.task.endoscope, self._look, self.task.step_count)
+        return Shown(self.task.lesions, moved, endoscope, self._look, self.task.step_count)
 
     def _show(self) -> None:
         if self.render_mode == "human":
@@ -430,13 +411,13 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             return ""
         index = int(bad[0])
         return (
-            f"observation {self.task.entry_name(index)} = {values[index]:g} left its bounds, {self._low[index]:g} to "
+            f"observation {self.layout.entry_name(index)} = {values[index]:g} left its bounds, {self._low[index]:g} to "
             f"{self._high[index]:g}"
         )
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
         residual = self.simulation.instrument.trocar_residual
-        member = {} if self.task.family is None else {"member": str(self.task.anatomy.member)}
+        member = {} if self.runtime.family is None else {"member": str(self.task.anatomy.member)}
         return {
             "sim_fault": fault,
             "sensor_saturated": saturated,

@@ -11,7 +11,7 @@ import pytest
 import msdm_core
 import surgsim_env.scripting
 from surgsim_env.envs.ids import TASKS
-from surgsim_env.tasks.declaration import docstring_sections
+from surgsim_env.tasks.declaration import docstring_sections, reward_weights
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -104,7 +104,7 @@ def test_tables_have_every_command_channel_and_reward(id):
     ):  # fmt: skip
         rows = re.findall(r"^\| `(\w+)` \| (\S[^|]*) \|", told[heading], flags=re.MULTILINE)
         assert [name for name, _ in rows] == [part.name for part in parts]
-    assert {name: float(weight) for name, weight in rows} == dict(task.weights)
+    assert {name: float(weight) for name, weight in rows} == reward_weights(task)
 
 
 def test_every_command_and_every_option_is_on_the_page():

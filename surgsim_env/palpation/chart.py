@@ -18,7 +18,7 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.site_press import SitePress, in_threads, press_in_lanes, press_phases
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass, with_substeps
 from surgsim_env.scene.digest import PHYSICS_VERSION, content_digest
-from surgsim_env.scene.family import KEPT_MOST
+from surgsim_env.scene.family import CACHED_MOST
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
@@ -294,7 +294,7 @@ class HealthyMap:
         return interpolated(self.grid, places)
 
 
-@lru_cache(maxsize=KEPT_MOST + 8)
+@lru_cache(maxsize=CACHED_MOST + 8)
 def charted_face(anatomy: Anatomy) -> ChartedFace:
     """The palpable face of an anatomy with its chart; the same anatomy gives the same object."""
     return ChartedFace(anatomy, make_chart(anatomy.face, anatomy.scene.instrument.tip_radius))

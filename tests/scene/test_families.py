@@ -125,7 +125,7 @@ def test_a_fold_is_drawn_again(monkeypatch):
         shape = make(family, of, rng)
         spoiled = [
             replace(
-                shape, bump_place=np.zeros((1, 3)), bump_way=np.array([[0.02, 0, 0]]), bump_width=np.array([0.004])
+                shape, bump_place=np.zeros((1, 3)), bump_shift=np.array([[0.02, 0, 0]]), bump_width=np.array([0.004])
             ),
             replace(shape, stretch=np.array([1.0, 1.0, 0.05])),
             replace(shape, stretch=np.array([1.6, 1.0, 1.0])),

@@ -46,7 +46,7 @@ def test_numbers_that_are_not_above_zero(place, value):
     step, field = place
     with pytest.raises(ValueError) as caught:
         MADE[step](**{field: value})
-    assert str(caught.value).startswith(f"{step}: {field} is {value!r}; it must be a finite number above 0")
+    assert str(caught.value).startswith(f"{step}: {field} is {value!r}")
 
 
 POINTS = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)

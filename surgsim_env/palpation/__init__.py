@@ -1,4 +1,4 @@
-"""Presses, contrast maps, lesion estimators and scores of palpation; `surgsim palpate`."""
+"""Palpation: presses, charts of faces, contrast maps, lesion estimators, errors."""
 
 from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE, TouchMap, healthy_file, interpolated, write_healthy_map
 from surgsim_env.palpation.lesion_estimator import (

@@ -146,9 +146,10 @@ class PalpableFace:
         return top is None or float(matmul(top[0] - point, -self.approach)) <= OPEN_GAP
 
     def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
-        """Point of `drop`, or None if no tool may press there.
+        """Pressable point of the face over a point of the plane, as in `drop`, or None.
 
-        None if the organ is thin, the border nearer than the margin less a slack [m], or other tissue in the way.
+        A point is not pressable over a thin organ, nearer to the border than the margin less a slack [m], or with other
+        tissue in the way.
         """
         hit = _drop(*self._plane, u, v)
         if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
@@ -322,12 +323,12 @@ def hidden_share(force: float, tip_radius: float, press_depth: float, contact_st
     return 2.25 * force / (math.pi * contact_stiffness * tip_radius * (press_depth * press_depth))
 
 
-def warn_of_coarse_cells(what: str, cell: float, tip_radius: float, press_depth: float) -> None:
+def warn_of_coarse_cells(owner: str, cell: float, tip_radius: float, press_depth: float) -> None:
     """Warn if the cells are so coarse that the mesh itself would be felt."""
     radius = contact_radius(tip_radius, press_depth)
     if cell > SHARE_LARGEST * radius:
         warnings.warn(
-            f"{what}: cell / contact radius is {share_text(cell, tip_radius, press_depth)}; use cells of at most "
+            f"{owner}: cell / contact radius is {share_text(cell, tip_radius, press_depth)}; use cells of at most "
             f"{radius * 1e3:.3g} mm, a larger tip or a deeper press",
             stacklevel=2,
         )

@@ -154,10 +154,10 @@ def test_a_press_of_the_scan_feels_what_the_probe_feels(name):
     for instrument in ("probe", name):
         anatomy = phantom(instrument)
         simulation = Simulation(anatomy)
-        found = press(simulation, np.array([0.025, 0.03, 0.03]), np.array([0.0, 0.0, 1.0]))
-        assert not found.end
-        forces.append(found.force)
-        depths.append(found.depth)
+        result = press(simulation, np.array([0.025, 0.03, 0.03]), np.array([0.0, 0.0, 1.0]))
+        assert not result.end
+        forces.append(result.force)
+        depths.append(result.depth)
     assert depths[1] == pytest.approx(depths[0], abs=1e-4)
     assert forces[1] == pytest.approx(forces[0], rel=0.04)
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.arithmetic import dot, matmul, norm
+from msdm_core.arithmetic import dot, eigh, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm
@@ -125,6 +125,11 @@ class Arm:
         axis = dot(rotations, self.shape_half_axis[:, None])
         centre = data.geom_xpos[self.shapes]
         return np.stack([centre - axis, centre + axis], axis=1)
+
+    def manipulability(self, joints: ArrayLike) -> float:
+        """Yoshikawa's sqrt(det J J^T) of the tip's velocity over all joints; its unit follows from the joints'."""
+        linear = self.tip_jacobian(joints)[:3]
+        return float(np.sqrt(np.prod(np.maximum(eigh(matmul(linear, linear.T))[0], 0.0))))
 
     def write(self, data: mujoco.MjData, joints: ArrayLike, jaw: float = 0.0) -> None:
         """Write joint values (n,) and a jaw angle [rad], shared by its fingers, into MuJoCo's coordinates."""

@@ -1,4 +1,4 @@
-"""Quality of a mesh: the shape of its tets, and its fit to the surface from which it was made."""
+"""Quality of a mesh: shapes of its tets, fit to a surface."""
 
 from dataclasses import dataclass
 
@@ -21,19 +21,19 @@ class MeshQuality:
     dihedral_largest_deg: float  # [degrees]; 90 on a BCC lattice
     radius_ratio_smallest: float  # 3 inradius / circumradius: 1 for a regular tet, 0 for a flat one
     volume: float  # [m^3]
-    volume_error: float | None  # (mesh - surface) / surface; None where no surface was given
+    volume_error: float | None  # (mesh - surface) / surface; None without a surface
 
 
 def mesh_quality(mesh: TetMesh, surface: tuple[ArrayLike, ArrayLike] | None = None) -> MeshQuality:
-    """Measure a mesh.
+    """Quality figures of a mesh.
 
     Args:
         mesh: the mesh.
-        surface: vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3) that it should fill, if any.
+        surface: vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3) of the filled surface, if any.
     """
     angles = dihedral_angles(mesh)
     volume = float(mesh.volumes.sum())
-    wanted = surface_volume(*surface) if surface is not None else None
+    filled = None if surface is None else surface_volume(*surface)
     return MeshQuality(
         node_count=mesh.node_count,
         tet_count=mesh.tet_count,
@@ -42,7 +42,7 @@ def mesh_quality(mesh: TetMesh, surface: tuple[ArrayLike, ArrayLike] | None = No
         dihedral_largest_deg=float(angles.max()),
         radius_ratio_smallest=float(radius_ratios(mesh).min()),
         volume=volume,
-        volume_error=None if wanted is None else (volume - wanted) / wanted,
+        volume_error=None if filled is None else (volume - filled) / filled,
     )
 
 
@@ -81,7 +81,7 @@ def _face_area_vectors(points: FloatArray, tets: NDArray[np.integer]) -> FloatAr
 
 
 def surface_cell(mesh: TetMesh, triangles: NDArray[np.int32]) -> float:
-    """Edge a of the cubic lattice cell whose tets, of a^3 / 12, have the median volume of those at a surface [m].
+    """Cell edge a of the BCC lattice with tets (volume a^3 / 12) of the median volume of those at a surface [m].
 
     Args:
         mesh: the organ.

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import arccos, cbrt, dot, norm
 from msdm_core.mesh.surface import surface_volume
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, area_vectors
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def dihedral_angles(mesh: TetMesh) -> FloatArray:
 
 def tet_angles(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     """`dihedral_angles` of tets with positive volumes [degrees], shape (n_tet, 6)."""
-    normals = _face_area_vectors(points, tets)
+    normals = area_vectors(points[tets[:, TET_FACES]])
     normals = normals / norm(normals, axis=2, keepdims=True)
     i, j = np.triu_indices(4, k=1)
     cosines = -dot(normals[:, i], normals[:, j])
@@ -65,19 +65,13 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
 
     V is the volume, S the area of the four faces, a, b, c the edges from corner 0 (Liu and Joe 1994).
     """
-    area = norm(_face_area_vectors(mesh.points, mesh.tets), axis=2).sum(axis=1)
+    area = norm(area_vectors(mesh.points[mesh.tets[:, TET_FACES]]), axis=2).sum(axis=1)
     corners = mesh.points[mesh.tets]
     a, b, c = (corners[:, corner] - corners[:, 0] for corner in (1, 2, 3))
     parts = [(p * p).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b))]
     sums = parts[0] + parts[1] + parts[2]
     circumradius = norm(sums, axis=1) / (12 * mesh.volumes)
     return 3 * (3 * mesh.volumes / area) / circumradius
-
-
-def _face_area_vectors(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
-    """Outward normal times area of the face opposite each corner [m^2], shape (n_tet, 4, 3)."""
-    a, b, c = (points[tets[:, TET_FACES[:, corner]]] for corner in range(3))
-    return np.cross(b - a, c - a) / 2
 
 
 def surface_cell(mesh: TetMesh, triangles: NDArray[np.int32]) -> float:

@@ -9,6 +9,7 @@ from msdm_core.kernels.ray_kernels import pierces
 from msdm_core.mesh.tet_mesh import (
     FloatArray,
     Int64Array,
+    area_vectors,
     check_finite,
     check_indices,
     connected_parts,
@@ -48,8 +49,7 @@ def outward_facing(
     points: FloatArray, triangles: NDArray[np.integer], direction: ArrayLike, angle_deg: float
 ) -> NDArray[np.bool_]:
     """`triangles_facing` for triangles in outward order."""
-    a, b, c = (points[corner] for corner in triangles.T)
-    normal = np.cross(b - a, c - a)
+    normal = area_vectors(points[triangles])
     along = np.asarray(direction, dtype=np.float64)
     cosine = -matmul(normal, along) / (norm(normal, axis=1) * norm(along))
     return cosine >= cos(np.radians(angle_deg))
@@ -62,8 +62,7 @@ def node_normals(points: FloatArray, triangles: NDArray[np.integer]) -> FloatArr
         points: nodes [m], shape (n_node, 3).
         triangles: corners in outward order, shape (n_triangle, 3).
     """
-    corners = points[triangles]
-    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area_vector = area_vectors(points[triangles])
     normals = np.zeros_like(points)
     for corner in range(3):
         np.add.at(normals, triangles[:, corner], area_vector)
@@ -116,13 +115,13 @@ def _checked_arrays(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArr
 def _check_shape(points: FloatArray, corners: Int64Array) -> None:
     a, b, c = (points[corner] for corner in corners.T)
     longest = np.max([np.square(p - q).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    doubled_area = norm(np.cross(b - a, c - a), axis=1)
-    flat = np.flatnonzero(doubled_area <= DEGENERATE_HEIGHT_RATIO * longest)
+    area = norm(area_vectors(points[corners]), axis=1)
+    flat = np.flatnonzero(2.0 * area <= DEGENERATE_HEIGHT_RATIO * longest)
     if flat.size:
         triangle = int(flat[0])
         raise MeshError(
             f"triangle {triangle} (of {flat.size}) at {_place(a[triangle])} is degenerate: area "
-            f"{doubled_area[triangle] / 2:.2g} m^2, the rule is a height above {DEGENERATE_HEIGHT_RATIO:g} of the "
+            f"{area[triangle]:.2g} m^2, the rule is a height above {DEGENERATE_HEIGHT_RATIO:g} of the "
             "longest edge: remove it, or merge its corners"
         )
 

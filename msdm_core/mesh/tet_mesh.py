@@ -164,6 +164,12 @@ def tet_volumes(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     return dot(b - a, np.cross(c - a, d - a)) / 6.0
 
 
+def area_vectors(corners: FloatArray) -> FloatArray:
+    """Area vector of each triangle, (b - a) x (c - a) / 2 [m^2], of corners (..., 3, 3) [m], shape (..., 3)."""
+    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
+    return 0.5 * np.cross(b - a, c - a)
+
+
 def oriented_tets(points: FloatArray, tets: Int64Array) -> Int64Array:
     """Tets with their last two corners exchanged where the volume is negative, shape (n_tet, 4)."""
     return np.where((tet_volumes(points, tets) < 0)[:, None], tets[:, [0, 1, 3, 2]], tets)

@@ -12,8 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.material.tissue_law import Stiffening
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.material import Stiffening
+from msdm_core.mesh import FloatArray
 
 # The least strain that is divided by.
 STRAIN_LEAST = 1e-12

@@ -1,4 +1,4 @@
-"""From materials to springs and masses."""
+"""Materials of an organ, and the springs and masses that follow from them."""
 
 from msdm_core.material.fitting import spring_fit
 from msdm_core.material.lumping import lump_mass, voronoi_fractions

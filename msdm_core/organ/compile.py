@@ -343,8 +343,8 @@ def _spring_law(
 
     def spring_mean(amount: FloatArray) -> FloatArray:
         first = float(amount[0])
-        total = spring_sum(mesh, spring_modulus, np.ones(mesh.tet_count), rule=spec.stiffness_rule)
-        difference = spring_sum(mesh, spring_modulus, amount - first, rule=spec.stiffness_rule)
+        total = spring_sum(mesh, spring_modulus, spec.stiffness_rule)
+        difference = spring_sum(mesh, spring_modulus * (amount - first), spec.stiffness_rule)
         return first + (difference / total)[springs]
 
     def node_sum(values: FloatArray) -> FloatArray:

@@ -117,11 +117,11 @@ def advance_or_raise(
 
 def _check_state(model: OrganModel, state: OrganState, shape_count: int) -> None:
     # Kernels check no array's bounds.
-    points, supports = (
-        len(model.surface_triangles) * QUADRATURE_COUNT,
-        (len(model.support_nodes), len(model.support_kind)),
-    )
-    organ = (len(model.node_mass), points, *supports, len(model.motion_node_shift))
+    point_count = len(model.surface_triangles) * QUADRATURE_COUNT
+    organ = (
+        len(model.node_mass), point_count, len(model.support_nodes), len(model.support_kind),
+        len(model.motion_node_shift),
+    )  # fmt: skip
     memory = (state.contact_engaged.shape[1], *state.support_stretch.shape[:2], len(state.motion))
     if (len(state.node_position), *memory) != organ or shape_count > len(state.contact_engaged):
         raise OrganError(

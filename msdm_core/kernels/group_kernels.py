@@ -1,8 +1,8 @@
-"""Springs and tets of one organ, GROUP at a time; node arrays are rows of four (x, y, z and nothing).
+"""Springs and tets of one organ, GROUP at a time; node arrays are rows of four (x, y, z and padding).
 
-The rows of a group are loaded and turned into vectors of x, y and z (`gather_kernels`), worked on by the equations of
-`element_kernels`, turned back and added up item by item: the same sums in the same order as the plain loops of
-`tissue_kernels`, which call these for an organ alone and do the items that are left over.
+The rows of a group are gathered into vectors of x, y and z (`gather_kernels`), enter the equations of
+`element_kernels`, and are added up item by item: the same sums in the same order as the plain loops of
+`tissue_kernels`, which call these functions for an organ alone and do the remaining items.
 """
 
 from numba import njit
@@ -46,7 +46,7 @@ from msdm_core.kernels.vector_kernels import (
     store_group,
 )
 
-# Pairs of numbers that two vectors hold, as a vector of the first and one of the second numbers; and back.
+# Pairs of numbers in two vectors as a vector of the first and a vector of the second numbers; and back.
 _firsts = define_shuffle([2 * item for item in range(GROUP)])
 _seconds = define_shuffle([2 * item + 1 for item in range(GROUP)])
 _low_pairs = define_shuffle([item + half for item in range(GROUP // 2) for half in (0, GROUP)])
@@ -55,7 +55,7 @@ _high_pairs = define_shuffle([item + half for item in range(GROUP // 2, GROUP) f
 
 @njit(**INLINED)
 def _give_way(arm_tension, arm, elastic, fade):
-    """Let one arm of a group of springs give way to their elastic tension over l0 [N/m]; returns its tension lost."""
+    """Relax one arm of a group of springs towards their elastic tension over l0 [N/m]; returns its relief."""
     before = load_group(arm_tension, arm)
     after = before + (elastic - before) * fade
     store_group(arm_tension, arm, after)
@@ -76,7 +76,7 @@ def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
 def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin):
     """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
 
-    Returns the first spring that is in no whole group.
+    Returns the first remaining spring.
     """
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
     for first in range(begin, whole, GROUP):
@@ -92,7 +92,7 @@ def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, b
 def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
     """`tissue_kernels.set_node_laws` of whole groups of nodes.
 
-    Returns the first node in none, whether one stiffens and whether one is steep.
+    Returns the first remaining node, True if any stiffens, True if any is steep.
     """
     whole = pairs.shape[0] // GROUP * GROUP
     stiffens = steepens = False
@@ -118,7 +118,7 @@ def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, ex
 def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
     """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
 
-    Returns the first spring that is in no whole group, and how many entries `law.steep` has.
+    Returns the first remaining spring and the number of entries in `law.steep`.
     """
     measured, lengths, pairs = law.measured, law.lengths, law.pairs
     stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
@@ -154,7 +154,7 @@ def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law
 def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
     """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
 
-    Returns the first tet that is in no whole group.
+    Returns the first remaining tet.
     """
     whole = tets.shape[0] // GROUP * GROUP
     for first in range(0, whole, GROUP):
@@ -177,8 +177,7 @@ def add_tet_groups(
 ):  # fmt: skip
     """Forces of whole groups of tets; arguments as in `tissue_kernels.add_tet_forces`.
 
-    Returns the first tet that is in no whole group, how many groups have a squeezed tet, and how many entries
-    `law.steep` has.
+    Returns the first remaining tet, the number of groups with a squeezed tet and of entries in `law.steep`.
     """
     measured, lengths, pairs = law.measured, law.lengths, law.pairs
     stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum

@@ -1,8 +1,9 @@
 """Springs, volume term and integration of an organ alone, or of organs of the same tets side by side.
 
 The equations are those of `element_kernels`, the places in memory those of `layout_kernels`. For an organ alone
-`group_kernels` does the bulk of springs and tets, GROUP at a time; the plain loops here do what is left over, and all
-of it for organs side by side. The sums have the same order in every case: an organ moves to the bit as it would alone.
+`group_kernels` does the bulk of springs and tets, GROUP at a time; the plain loops here do the remaining ones, and all
+of them for organs side by side. The sums have the same order in both cases: an organ in a lane moves to the bit as it
+would alone.
 """
 
 from numba import njit
@@ -57,7 +58,7 @@ from msdm_core.kernels.vector_kernels import GROUP, any_below, keep_lower
 
 @njit(**INLINED)
 def group_width(lanes):
-    """How many tets in a row an entry of `squeezed_tets` stands for."""
+    """Number of successive tets per entry of `squeezed_tets`."""
     if len(lanes) == 0:
         return GROUP
     return 1
@@ -82,10 +83,10 @@ def set_gravity(lanes, force, mass, gravity):
 
 @njit(**INNER)
 def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving, finite_sum):
-    """Symplectic Euler of the organs that move: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt).
+    """Symplectic Euler step of the moving organs: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt).
 
-    In:  force [N] (n_node, 4), inverse_mass [1/kg] (n_node,), dt [s], decay, moving: 1 where an organ moves (1,)
-    Out: position [m], velocity [m/s] (n_node, 4), finite_sum: finite where all of an organ's numbers are (1,)
+    In:  force [N] (n_node, 4), inverse_mass [1/kg] (n_node,), dt [s], decay, moving: 1 for a moving organ (1,)
+    Out: position [m], velocity [m/s] (n_node, 4), finite_sum: finite if all of an organ's numbers are (1,)
     """
     parts = parts_of(lanes)
     check = load_part(lanes, position, 0) * 0.0
@@ -103,9 +104,9 @@ def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving,
 
 @njit(**INNER)
 def put_back(lanes, values, kept, moving):
-    """Restore the kept values of organs that do not move.
+    """Restore the kept values of stopped organs.
 
-    In:  kept (n_node, 3, n_lane), moving: 1 where an organ moves (1, n_lane)
+    In:  kept (n_node, 3, n_lane), moving: 1 for a moving organ (1, n_lane)
     Out: values (n_node, 3, n_lane)
     """
     for part in range(3 * values.shape[0]):
@@ -115,7 +116,7 @@ def put_back(lanes, values, kept, moving):
 
 @njit(**INLINED)
 def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
-    """Pull the ends of a spring together with `scale` times the way from the one to the other."""
+    """Pull the ends of a spring together with `scale` times the vector between them."""
     x, y, z = x * scale, y * scale, z * scale
     add_to_node(lanes, force, nodes[spring, 0], x, y, z)
     take_from_node(lanes, force, nodes[spring, 1], x, y, z)
@@ -129,7 +130,7 @@ def _end_sum(lanes, pairs, items, item):
 
 @njit(**INLINED)
 def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
-    """`add_energy_groups` for an organ alone; returns the first spring that is left over."""
+    """`add_energy_groups` for an organ alone; returns the first remaining spring."""
     if len(lanes) == 0:
         return add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin)
     return begin
@@ -137,9 +138,9 @@ def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, r
 
 @njit(**INLINED)
 def _keep_length(lanes, lengths, spring, length):
-    """Note the length of a spring of an organ alone.
+    """Keep the length of a spring of an organ alone.
 
-    Organs side by side measure again: memory limits them, and to load all their lengths takes longer than the roots.
+    Organs side by side compute it again: memory limits them, and loads of all lengths take longer than the roots.
     """
     if len(lanes) == 0:
         lengths[spring] = length
@@ -147,7 +148,7 @@ def _keep_length(lanes, lengths, spring, length):
 
 @njit(**INLINED)
 def _kept_length(lanes, lengths, spring, x, y, z):
-    """What `_keep_length` noted; measured where it notes nothing."""
+    """Length of a spring, kept or computed again."""
     if len(lanes) == 0:
         return lengths[spring]
     return spring_length(x, y, z)
@@ -155,7 +156,7 @@ def _kept_length(lanes, lengths, spring, x, y, z):
 
 @njit(**INLINED)
 def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
-    """Note the length of a spring along an edge; returns its `spring_energy`."""
+    """Keep the length of a spring along an edge; returns its `spring_energy`."""
     length = spring_length(edge[0], edge[1], edge[2])
     _keep_length(lanes, lengths, item, length)
     return spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
@@ -180,7 +181,7 @@ def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length,
 
 @njit(**INLINED)
 def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
-    """`set_node_law_groups` for an organ alone; returns the first node left over, and what `set_node_laws` does."""
+    """`set_node_law_groups` for an organ alone; returns the first remaining node, and the results of `set_node_laws`."""
     if len(lanes) == 0:
         return set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness)
     return 0, False, False
@@ -188,14 +189,14 @@ def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset
 
 @njit(**INNER)
 def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
-    """From the sums of volumes and energies around nodes to the tension of the averaged volumes and to `node_law`.
+    """Tension of the averaged volumes and `node_law`, from the sums of volumes and energies around nodes.
 
     One loop for both, as the root and the quotient of the law take longer than all else of a node.
 
     In:  inverse_volume [1/m^3], bulk [Pa], softness [1/J], onset, growth, excess (n_node,) as in `OrganModel`
     Out: pairs: sums of six times the volumes [m^3] and of k (l - l0)^2 [J] before, tension [Pa] and half the factor on
          springs after (n_node, 2), steepness (n_node,)
-    Returns whether any factor is not 1 and whether any steepness is above STEEP_EXCESS.
+    Returns True if any factor differs from 1, and True if any steepness is above STEEP_EXCESS.
     """
     first, stiffens, steepens = _set_groups_of_node_laws(
         lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness
@@ -222,7 +223,7 @@ def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, e
 
 @njit(**INLINED)
 def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, steep_count):
-    """`add_spring_groups` for an organ alone; returns the first spring that is left over and the entries of `steep`."""
+    """`add_spring_groups` for an organ alone; returns the first remaining spring and the entries of `steep`."""
     if len(lanes) == 0:
         return add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count)
     return begin, steep_count
@@ -230,7 +231,7 @@ def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length
 
 @njit(**INLINED)
 def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
-    """Let one arm give way to the elastic tension over l0 of its spring [N/m]; returns what it has given way to."""
+    """Relax one arm towards the elastic tension over l0 of its spring [N/m]; returns its relief."""
     before = load_item(lanes, arm_tension, arm)
     after = before + (elastic - before) * fade
     store_item(lanes, arm_tension, arm, where_moving(lanes, moving, after, before))
@@ -239,10 +240,10 @@ def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
 
 @njit(**INLINED)
 def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic, fade, moving):
-    """Let the Maxwell arms of a spring give way to its elastic tension for some time: z_i <- z_i + fade_i (T_e - z_i).
+    """Relax the Maxwell arms of a spring towards its elastic tension: z_i <- z_i + fade_i (T_e - z_i).
 
-    The arm's own tension is g_i (T_e - z_i); all tensions are over l0. For a constant strain z_i nears T_e as
-    1 - exp(-t / tau_i), and the energy stored in an arm only falls while it gives way.
+    The arm's own tension is g_i (T_e - z_i); all tensions are over l0. At a constant strain z_i approaches T_e as
+    1 - exp(-t / tau_i), and the energy stored in an arm never rises by its relaxation.
 
     In:  arm_modulus g_i (3 * n_spring,), springs: n_spring, elastic T_e / l0 [N/m], fade: share for each arm, moving
     Out: arm_tension z_i / l0 [N/m] (3 * n_spring,), relief: sum_i g_i z_i / l0 [N/m] (n_spring,)
@@ -265,10 +266,10 @@ def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, beg
     """Springs from number `begin` on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their law.
 
     In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin, law:
-         `SpringLaw`, moving: 1 where an organ moves (1,)
-    Out: force, added to [N] (n_node, 4), law: arm_tension, relief, steep: the first of each `group_width` springs among
-         which one is strained beyond STEEP_SHARE
-    Returns how many entries `law.steep` has.
+         `SpringLaw`, moving: 1 for a moving organ (1,)
+    Out: force, added to [N] (n_node, 4), law: arm_tension, relief, steep: first of each `group_width` springs with a
+         steep spring
+    Returns the number of entries in `law.steep`.
     """
     measured, lengths, pairs = law.measured, law.lengths, law.pairs
     stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
@@ -319,7 +320,7 @@ def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta)
 
 @njit(**INLINED)
 def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
-    """`sum_tet_groups` for an organ alone; returns the first tet that is left over."""
+    """`sum_tet_groups` for an organ alone; returns the first remaining tet."""
     if len(lanes) == 0:
         return sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens)
     return 0
@@ -327,10 +328,10 @@ def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness,
 
 @njit(**INNER)
 def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
-    """Six times the volume of each tet added up at its corners; where springs stiffen, with twice its spring's energy.
+    """Sums of six times the volume of each tet at its corners, and of twice its spring's energy if springs stiffen.
 
     In:  position [m] (n_node, 4), tets (n_tet, 4), stiffness [N/m], rest_length [m] (n_spring,), stiffens
-    Out: total: volumes [m^3], added to (n_node,); where springs stiffen instead pairs: volumes [m^3] and energies [J],
+    Out: total: volumes [m^3], added to (n_node,); if springs stiffen instead pairs: volumes [m^3] and energies [J],
          added to (n_node, 2), and lengths as in `add_energies`
     """
     for tet in range(
@@ -348,7 +349,7 @@ def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_l
 
 @njit(**KERNEL)
 def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
-    """From the sums of six times the volumes around nodes to the tension of the averaged volumes.
+    """Tension of the averaged volumes, from the sums of six times the volumes around nodes.
 
     In:  node_inverse_volume [1/m^3], node_bulk [Pa] (n_node,)
     Out: tension: the sums before [m^3], [Pa] after (n_node,)
@@ -361,7 +362,7 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
 
 @njit(**INNER)
 def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffens):
-    """Beta's share of the averaged volume term: beta times the rates of volumes, to what `sum_at_nodes` adds up.
+    """Beta's share of the averaged volume term: beta times the rates of volumes, added to the sums of `sum_at_nodes`.
 
     In:  position [m], velocity [m/s] (n_node, 4), tets (n_tet, 4), beta [s], stiffens
     Out: total or the first numbers of pairs [m^3], as in `sum_at_nodes`
@@ -378,9 +379,9 @@ def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffe
 
 @njit(**INLINED)
 def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
-    """Add the forces of a tet on its corners: `scale` times `corner_gradient`, and `at_b` in place of that at b.
+    """Add the forces of a tet on its corners: `scale` times `corner_gradient`, at b `at_b`.
 
-    One corner after the other: all gradients at once do not fit into 16 registers.
+    Corner by corner: all gradients at once do not fit into 16 registers.
     """
     x, y, z = at_b
     add_to_node(lanes, force, tets[tet, 1], x, y, z)
@@ -399,7 +400,7 @@ def _add_groups_of_tets(
     lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
     law, steep_count,
 ):  # fmt: skip
-    """`add_tet_groups` for an organ alone; returns the first tet left over, the entries of `squeezed` and `steep`."""
+    """`add_tet_groups` for an organ alone; returns the first remaining tet, the entries of `squeezed` and `steep`."""
     if len(lanes) == 0:
         return add_tet_groups(
             position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
@@ -413,18 +414,17 @@ def add_tet_forces(
     lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving,
     squeezed, law, steep_count,
 ):  # fmt: skip
-    """Volume terms: a tet pulls its corners with its tension times dV/dx; spring t comes with tet t, its first edge.
+    """Volume terms: the tension of a tet pulls its corners along dV/dx; with tet t comes spring t, its first edge.
 
     K (J - 1) per tet adds K to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020); the
-    mean tension of the volumes averaged at its corners comes on top.
+    mean tension of the volumes averaged at its corners is added.
 
     In:  position [m] (n_node, 4), tension [Pa] (n_node,), tets (n_tet, 4), inverse_volume [1/m^3], bulk, averaged_bulk
-         [Pa] (n_tet,), stiffness [N/m], rest_length [m] (n_spring,), moving: 1 where an organ moves (1,), law:
+         [Pa] (n_tet,), stiffness [N/m], rest_length [m] (n_spring,), moving: 1 for a moving organ (1,), law:
          `SpringLaw`, steep_count: entries of `law.steep` so far
-    Out: force, added to [N] (n_node, 4), low: the smallest V / V0 seen, its value before included (1,),
-         squeezed: the first of each `group_width` tets among which one is below SQUEEZED_RATIO (n_tet,), law: as in
-         `add_spring_forces`
-    Returns how many entries `squeezed` and `law.steep` have.
+    Out: force, added to [N] (n_node, 4), low: smallest V / V0, the previous one included (1,), squeezed: first of each
+         `group_width` tets with a tet below SQUEEZED_RATIO (n_tet,), law: as in `add_spring_forces`
+    Returns the number of entries in `squeezed` and `law.steep`.
     """
     measured, lengths, pairs = law.measured, law.lengths, law.pairs
     stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum

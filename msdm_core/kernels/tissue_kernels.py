@@ -181,7 +181,7 @@ def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length,
 
 @njit(**INLINED)
 def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
-    """`set_node_law_groups` for an organ alone; returns the first remaining node, and the results of `set_node_laws`."""
+    """`set_node_law_groups` for an organ alone; returns the first remaining node and the results of `set_node_laws`."""
     if len(lanes) == 0:
         return set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness)
     return 0, False, False

@@ -343,7 +343,7 @@ def hold_share(rows, number, corner, weight, along, across, dt):
 
 @njit(**INLINED)
 def begin_hold(position, shapes, rows, places, number):
-    """Start of a point's hold: the tool's speed along its slopes and at the point, no change of pressure and stretch."""
+    """Start of a point's hold: tool speed along its slopes and at the point, no change of pressure and stretch yet."""
     centre, twist = shapes.tool_centre, shapes.tool_twist
     point = places[number, 1] % QUADRATURE_COUNT
     tool = shapes.shape_tool[places[number, 0]]

@@ -126,8 +126,8 @@ def test_the_equivalent_strain_of_a_bar_is_its_strain(strain: float):
         gradient = across * np.eye(3) + (1.0 + strain - across) * np.outer(axis, axis)
         state = blank_state(model)
         state.node_position[:] = model.node_rest_position @ gradient
-        found = equivalent_strain(model, state)[inner]
-        np.testing.assert_allclose(found, abs(strain), rtol=0, atol=strain**2)
+        measured = equivalent_strain(model, state)[inner]
+        np.testing.assert_allclose(measured, abs(strain), rtol=0, atol=strain**2)
 
 
 def test_tangent_is_the_slope_of_the_tension():
@@ -325,15 +325,15 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
 
 
 def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatArray:
-    """The matrix that `hold_steep` makes of velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
+    """Matrix of `hold_steep` on velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
     scale = np.sqrt(model.node_mass)[:, None]
-    every, columns = np.arange(len(model.spring_nodes), dtype=np.int32), []
+    springs, columns = np.arange(len(model.spring_nodes), dtype=np.int32), []
     for unit in np.eye(state.node_velocity.size):
         velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
         hold_steep(
             (), state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes,
             model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes),
-            every, len(every), 1, sweeps, sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
+            springs, len(springs), 1, sweeps, sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
         )  # fmt: skip
         columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
     return np.array(columns).T

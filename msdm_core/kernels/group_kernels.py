@@ -1,8 +1,8 @@
-"""Springs and tets of one organ, GROUP at a time; node arrays are rows of four (x, y, z and nothing).
+"""Springs and tets of one organ, GROUP at a time; node arrays are rows of four (x, y, z and padding).
 
-The rows of a group are loaded and turned into vectors of x, y and z (`gather_kernels`), worked on by the equations of
-`element_kernels`, turned back and added up item by item: the same sums in the same order as the plain loops of
-`tissue_kernels`, which call these for an organ alone and do the items that are left over.
+The rows of a group are gathered into vectors of x, y and z (`gather_kernels`), enter the equations of
+`element_kernels`, and are added up item by item: the same sums in the same order as the plain loops of
+`tissue_kernels`, which call these functions for an organ alone and do the remaining items.
 """
 
 from numba import njit
@@ -46,7 +46,7 @@ from msdm_core.kernels.vector_kernels import (
     store_group,
 )
 
-# Pairs of numbers that two vectors hold, as a vector of the first and one of the second numbers; and back.
+# Pairs of numbers in two vectors as a vector of the first and a vector of the second numbers; and back.
 _firsts = define_shuffle([2 * item for item in range(GROUP)])
 _seconds = define_shuffle([2 * item + 1 for item in range(GROUP)])
 _low_pairs = define_shuffle([item + half for item in range(GROUP // 2) for half in (0, GROUP)])
@@ -55,7 +55,7 @@ _high_pairs = define_shuffle([item + half for item in range(GROUP // 2, GROUP) f
 
 @njit(**INLINED)
 def _give_way(arm_tension, arm, elastic, fade):
-    """Let one arm of a group of springs give way to their elastic tension over l0 [N/m]; returns its tension lost."""
+    """Relax one arm of a group of springs towards their elastic tension over l0 [N/m]; returns its relief."""
     before = load_group(arm_tension, arm)
     after = before + (elastic - before) * fade
     store_group(arm_tension, arm, after)
@@ -75,7 +75,7 @@ def _fade_arms(model, state, first, elastic, fade):
 
 @njit(**INNER)
 def add_energy_groups(model, state):
-    """`tissue_kernels.add_energies` of whole groups of springs; returns the first spring that is in none."""
+    """`tissue_kernels.add_energies` of whole groups of springs; returns the first remaining spring."""
     position, pairs, lengths, nodes = state.row_position, state.node_pairs, state.spring_lengths, model.spring_nodes
     stiffness, rest_length, begin = model.spring_stiffness, model.spring_rest_length, model.tet_nodes.shape[0]
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
@@ -92,7 +92,7 @@ def add_energy_groups(model, state):
 def set_node_law_groups(model, state):
     """`tissue_kernels.set_node_laws` of whole groups of nodes.
 
-    Returns the first node in none, whether one stiffens and whether one is steep.
+    Returns the first remaining node, True if any stiffens, True if any is steep.
     """
     pairs, steepness, inverse_volume, bulk = (
         state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
@@ -122,7 +122,7 @@ def set_node_law_groups(model, state):
 def add_spring_groups(model, state, law):
     """`tissue_kernels.add_spring_forces` of whole groups of springs.
 
-    Returns the first spring that is in none, and how many entries `steep_springs` has.
+    Returns the first remaining spring and the number of entries in `steep_springs`.
     """
     position, force, nodes, begin = state.row_position, state.row_force, model.spring_nodes, model.tet_nodes.shape[0]
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
@@ -156,7 +156,7 @@ def add_spring_groups(model, state, law):
 
 @njit(**INNER)
 def sum_tet_groups(model, state):
-    """`tissue_kernels.sum_at_nodes` of whole groups of tets; returns the first tet that is in none."""
+    """`tissue_kernels.sum_at_nodes` of whole groups of tets; returns the first remaining tet."""
     position, total, pairs, lengths = state.row_position, state.node_tension, state.node_pairs, state.spring_lengths
     tets, stiffens = model.tet_nodes, model.stiffens
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
@@ -178,8 +178,7 @@ def sum_tet_groups(model, state):
 def add_tet_groups(model, state, law, steep_count):
     """`tissue_kernels.add_tet_forces` of whole groups of tets.
 
-    Returns the first tet that is in none, how many groups have a squeezed tet, and how many entries `steep_springs`
-    has.
+    Returns the first remaining tet, the number of groups with a squeezed tet and of entries in `steep_springs`.
     """
     position, force, tension, tets = state.row_position, state.row_force, state.node_tension, model.tet_nodes
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length

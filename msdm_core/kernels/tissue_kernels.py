@@ -1,8 +1,9 @@
 """Springs, volume term and integration of an organ alone, or of organs of the same tets side by side.
 
 The equations are those of `element_kernels`, the places in memory those of `layout_kernels`. For an organ alone
-`group_kernels` does the bulk of springs and tets, GROUP at a time; the plain loops here do what is left over, and all
-of it for organs side by side. The sums have the same order in every case: an organ moves to the bit as it would alone.
+`group_kernels` does the bulk of springs and tets, GROUP at a time; the plain loops here do the remaining ones, and all
+of them for organs side by side. The sums have the same order in both cases: an organ in a lane moves to the bit as it
+would alone.
 """
 
 from numba import njit
@@ -74,7 +75,7 @@ def set_gravity(lanes, model, state):
 
 @njit(**INNER)
 def integrate(lanes, model, state, dt, decay):
-    """Symplectic Euler of the organs that move: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt)."""
+    """Symplectic Euler step of the moving organs: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt)."""
     position, velocity, force = nodes_of(lanes, state)
     inverse_mass, moving = model.node_inverse_mass, state.moving
     parts = parts_of(lanes)
@@ -93,7 +94,7 @@ def integrate(lanes, model, state, dt, decay):
 
 @njit(**INNER)
 def put_back(lanes, state):
-    """Restore the kept forces of the lanes that do not move."""
+    """Restore the kept forces of stopped organs."""
     values, kept, moving = state.node_force, state.kept_force, state.moving
     for part in range(3 * values.shape[0]):
         value = where_moving(lanes, moving, load_part(lanes, values, part), load_part(lanes, kept, part))
@@ -102,7 +103,7 @@ def put_back(lanes, state):
 
 @njit(**INLINED)
 def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
-    """Pull the ends of a spring together with `scale` times the way from the one to the other."""
+    """Pull the ends of a spring together with `scale` times the vector between them."""
     x, y, z = x * scale, y * scale, z * scale
     add_to_node(lanes, force, nodes[spring, 0], x, y, z)
     take_from_node(lanes, force, nodes[spring, 1], x, y, z)
@@ -116,9 +117,9 @@ def _end_sum(lanes, pairs, items, item):
 
 @njit(**INLINED)
 def _keep_length(lanes, lengths, spring, length):
-    """Note the length of a spring of an organ alone.
+    """Keep the length of a spring of an organ alone.
 
-    Organs side by side measure again: memory limits them, and to load all their lengths takes longer than the roots.
+    Organs side by side compute it again: memory limits them, and loads of all lengths take longer than the roots.
     """
     if len(lanes) == 0:
         lengths[spring] = length
@@ -126,7 +127,7 @@ def _keep_length(lanes, lengths, spring, length):
 
 @njit(**INLINED)
 def _kept_length(lanes, lengths, spring, x, y, z):
-    """What `_keep_length` noted; measured where it notes nothing."""
+    """Length of a spring, kept or computed again."""
     if len(lanes) == 0:
         return lengths[spring]
     return spring_length(x, y, z)
@@ -134,7 +135,7 @@ def _kept_length(lanes, lengths, spring, x, y, z):
 
 @njit(**INLINED)
 def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
-    """Note the length of a spring along an edge; returns its `spring_energy`."""
+    """Keep the length of a spring along an edge; returns its `spring_energy`."""
     length = spring_length(edge[0], edge[1], edge[2])
     _keep_length(lanes, lengths, item, length)
     return spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
@@ -161,12 +162,12 @@ def add_energies(lanes, model, state):
 
 @njit(**INNER)
 def set_node_laws(lanes, model, state):
-    """From the sums of volumes and energies around nodes to the tension of the averaged volumes and to `node_law`.
+    """Tension of the averaged volumes and `node_law`, from the sums of volumes and energies around nodes.
 
     Pairs hold the sums of six times the volumes [m^3] and of k (l - l0)^2 [J] before, tension [Pa] and half the factor
     on springs after. One loop for both, as the root and the quotient of the law take longer than all else of a node.
 
-    Returns whether any factor is not 1 and whether any steepness is above STEEP_EXCESS.
+    Returns True if any factor differs from 1, and True if any steepness is above STEEP_EXCESS.
     """
     pairs, steepness, inverse_volume, bulk = (
         state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
@@ -197,7 +198,7 @@ def set_node_laws(lanes, model, state):
 
 @njit(**INLINED)
 def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
-    """Let one arm give way to the elastic tension over l0 of its spring [N/m]; returns what it has given way to."""
+    """Relax one arm towards the elastic tension over l0 of its spring [N/m]; returns its relief."""
     before = load_item(lanes, arm_tension, arm)
     after = before + (elastic - before) * fade
     store_item(lanes, arm_tension, arm, where_moving(lanes, moving, after, before))
@@ -206,10 +207,10 @@ def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
 
 @njit(**INLINED)
 def fade_arms(lanes, model, state, spring, elastic, fade):
-    """Let the Maxwell arms of a spring give way to its elastic tension for some time: z_i <- z_i + fade_i (T_e - z_i).
+    """Relax the Maxwell arms of a spring towards its elastic tension: z_i <- z_i + fade_i (T_e - z_i).
 
-    The arm's own tension is g_i (T_e - z_i); all tensions are over l0. For a constant strain z_i nears T_e as
-    1 - exp(-t / tau_i), and the energy stored in an arm only falls while it gives way.
+    The arm's own tension is g_i (T_e - z_i); all tensions are over l0. At a constant strain z_i approaches T_e as
+    1 - exp(-t / tau_i), and the energy stored in an arm never rises by its relaxation.
 
     In:  elastic T_e / l0 [N/m], fade: share for each arm
     Out: spring_arm_tension z_i / l0, spring_relief
@@ -233,8 +234,8 @@ def fade_arms(lanes, model, state, spring, elastic, fade):
 def add_spring_forces(lanes, model, state, law):
     """Springs without a tet: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their `SpringLaw`.
 
-    The arms give way, and `steep_springs` gets the first of each `group_width` springs among which one is strained
-    beyond STEEP_SHARE. Returns how many entries it has.
+    The arms relax, and `steep_springs` gets the first of each `group_width` springs with a steep spring. Returns the
+    number of its entries.
     """
     position, _, force = nodes_of(lanes, state)
     nodes, stiffness, rest_length = model.spring_nodes, model.spring_stiffness, model.spring_rest_length
@@ -287,7 +288,7 @@ def add_spring_damping(lanes, model, state):
 
 @njit(**INNER)
 def sum_at_nodes(lanes, model, state):
-    """Six times the volume of each tet [m^3] added up at its corners, in node_tension.
+    """Sums of six times the volume of each tet [m^3] at its corners, in node_tension.
 
     Where springs stiffen, in node_pairs with twice its spring's energy [J], as of `add_energies`.
     """
@@ -309,7 +310,7 @@ def sum_at_nodes(lanes, model, state):
 
 @njit(**KERNEL)
 def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
-    """From the sums of six times the volumes around nodes to the tension of the averaged volumes.
+    """Tension of the averaged volumes, from the sums of six times the volumes around nodes.
 
     In:  node_inverse_volume [1/m^3], node_bulk [Pa] (n_node,)
     Out: tension: the sums before [m^3], [Pa] after (n_node,)
@@ -322,7 +323,7 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
 
 @njit(**INNER)
 def add_volume_rates(lanes, model, state):
-    """Beta's share of the averaged volume term: beta times the rates of volumes, to what `sum_at_nodes` adds up."""
+    """Beta's share of the averaged volume term: beta times the rates of volumes, added to the sums of `sum_at_nodes`."""
     position, velocity, _ = nodes_of(lanes, state)
     total, pairs, tets, beta, stiffens = (
         state.node_tension, state.node_pairs, model.tet_nodes, model.beta, model.stiffens
@@ -339,9 +340,9 @@ def add_volume_rates(lanes, model, state):
 
 @njit(**INLINED)
 def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
-    """Add the forces of a tet on its corners: `scale` times `corner_gradient`, and `at_b` in place of that at b.
+    """Add the forces of a tet on its corners: `scale` times `corner_gradient`, at b `at_b`.
 
-    One corner after the other: all gradients at once do not fit into 16 registers.
+    Corner by corner: all gradients at once do not fit into 16 registers.
     """
     x, y, z = at_b
     add_to_node(lanes, force, tets[tet, 1], x, y, z)
@@ -357,14 +358,14 @@ def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
 
 @njit(**INNER)
 def add_tet_forces(lanes, model, state, law, steep_count):
-    """Volume terms: a tet pulls its corners with its tension times dV/dx; spring t comes with tet t, its first edge.
+    """Volume terms: the tension of a tet pulls its corners along dV/dx; with tet t comes spring t, its first edge.
 
     K (J - 1) per tet adds K to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020); the
-    mean tension of the volumes averaged at its corners comes on top.
+    mean tension of the volumes averaged at its corners is added.
 
-    Notes the smallest V / V0 seen, and in `squeezed_tets` the first of each `group_width` tets among which one is below
+    Keeps the smallest V / V0, and in `squeezed_tets` the first of each `group_width` tets with a tet below
     SQUEEZED_RATIO; arms and `steep_springs` as in `add_spring_forces`, of which steep_count entries are there so far.
-    Returns how many entries `squeezed_tets` and `steep_springs` have.
+    Returns the numbers of entries in `squeezed_tets` and `steep_springs`.
     """
     position, _, force = nodes_of(lanes, state)
     tension, tets = state.node_tension, model.tet_nodes

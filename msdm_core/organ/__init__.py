@@ -1,4 +1,4 @@
-"""Compiling an organ, its supports, its stable step, and advancing it."""
+"""Organs: compilation, supports and foundations, stable step, integration, measured quantities."""
 
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import (

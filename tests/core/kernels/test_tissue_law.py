@@ -128,8 +128,8 @@ def test_the_equivalent_strain_of_a_bar_is_its_strain(strain: float):
         gradient = across * np.eye(3) + (1.0 + strain - across) * np.outer(axis, axis)
         state = blank_state(model)
         state.node_position[:] = model.node_rest_position @ gradient
-        found = equivalent_strain(model, state)[inner]
-        np.testing.assert_allclose(found, abs(strain), rtol=0, atol=strain**2)
+        measured = equivalent_strain(model, state)[inner]
+        np.testing.assert_allclose(measured, abs(strain), rtol=0, atol=strain**2)
 
 
 def test_tangent_is_the_slope_of_the_tension():
@@ -327,7 +327,7 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
 
 
 def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatArray:
-    """The matrix that `hold_steep` makes of velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
+    """Matrix of `hold_steep` on velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
     scale = np.sqrt(model.node_mass)[:, None]
     tets, springs, columns = len(model.tet_nodes), len(model.spring_nodes), []
     groups = np.r_[0:tets:GROUP, tets:springs:GROUP].astype(np.int32)

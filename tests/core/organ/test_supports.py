@@ -210,7 +210,7 @@ def test_the_same_organ_settles_once(monkeypatch):
     calls = []
     relax = organ_compile._relax
     monkeypatch.setattr(organ_compile, "_settled", type(organ_compile._settled)())
-    monkeypatch.setattr(organ_compile, "REMEMBERED", 2)
+    monkeypatch.setattr(organ_compile, "CACHED", 2)
     monkeypatch.setattr(organ_compile, "_relax", lambda *given: (calls.append(1), relax(*given)))
     first = rest_state(free_block(FLOOR))
     again = rest_state(free_block(FLOOR))

@@ -7,8 +7,19 @@ import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh import FloatArray, TetMesh
-from surgsim_apps.palpate.scene_options import FAT_NAME, FAT_SOURCE, soft_bed
-from surgsim_env.scene import Anchor, Ball, Vector
+from surgsim_env.scene import Anchor, Ball, Side, Vector
+
+# An organ lies in fat but for the side that faces the probe: E / h and E / 3h of 8 mm of it (chosen).
+# E is 3 x 752 Pa, the shear modulus of human fat that bears no load, by MR elastography at 50 Hz (gluteal, J Mech Behav
+# Biomed Mater 2023, "Strain-dependent shear properties of human adipose tissue in vivo"); in pigs 3 x 530 Pa (doi
+# 10.1007/s10237-010-0207-9).
+FAT_STIFFNESS, FAT_SHEAR_STIFFNESS = 2.8e5, 9.4e4
+# It reaches around the flanks: largest angle between outward normal and approach [degrees].
+FAT_ANGLE = 110.0
+FAT_SOURCE = (
+    "[N/m^3] E / h, and E / 3h across, of a layer of fat, h 8 mm (chosen), E 3 x 752 Pa (human, MR elastography 2023)"
+)
+FAT_NAME = "surrounding fat and wall"
 
 # Stiffness of ligaments and of a hilum, per area [N/m^3]: chosen, four times that of fat: 1 mm under 1 kPa.
 LIGAMENT_STIFFNESS, LIGAMENT_SHEAR_STIFFNESS = 1.0e6, 3.3e5
@@ -41,6 +52,11 @@ ATTACHMENTS: Mapping[str, tuple[Attachment, ...]] = {
     "spleen": (Attachment("hilum", (-0.9, -0.4, 0.0), 0.14),),
     "kidney": (Attachment("hilum", (-1.0, -0.3, 0.0), 0.10),),
 }
+
+
+def soft_bed(approach: Vector, name: str = FAT_NAME) -> Anchor:
+    """Fat over the side away from the probe and the flanks."""
+    return Anchor(name, side=Side(approach, FAT_ANGLE), stiffness=FAT_STIFFNESS, shear_stiffness=FAT_SHEAR_STIFFNESS)
 
 
 def organ_anchors(

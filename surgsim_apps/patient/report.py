@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-GENERATOR = "surgsim organ"
 VOLUME_ERROR_LARGEST = 0.02
 
 # Cells of a table, the first of which names the row.
@@ -61,7 +60,7 @@ def report_page(
     )
     return render_page(
         "organ.html.j2",
-        generator=GENERATOR,
+        generator="surgsim organ",
         title=f"Organ: {organ.scene.description}",
         verdict=verdict(organ),
         notes=[*organ.patient.notes, *organ.notes],

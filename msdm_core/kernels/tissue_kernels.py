@@ -323,7 +323,7 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
 
 @njit(**INNER)
 def add_volume_rates(lanes, model, state):
-    """Beta's share of the averaged volume term: beta times the rates of volumes, added to the sums of `sum_at_nodes`."""
+    """Beta's share of the averaged volume term: beta times rates of volumes, added to the sums of `sum_at_nodes`."""
     position, velocity, _ = nodes_of(lanes, state)
     total, pairs, tets, beta, stiffens = (
         state.node_tension, state.node_pairs, model.tet_nodes, model.beta, model.stiffens

@@ -25,7 +25,7 @@ class Identify:
     thickness: MaybeNumber = None
     """Thickness of the tissue on its rigid bed [m]; default: searched, with an interval."""
     poisson_ratio: float = 0.45
-    """Poisson's ratio of the tissue; presses alone do not tell it."""
+    """Poisson's ratio of the tissue; not identifiable by presses alone."""
     seed: int = 0
     """Seed that draws which half of the sites is fitted."""
     out: MaybePath = None
@@ -38,7 +38,7 @@ class Identify:
         return command_text(["surgsim", "identify", *map(str, self.recordings)], options)
 
     def run(self, console: Console) -> int:
-        """Identify, print the errors and what the data cannot tell, write the results; returns 0.
+        """Identify, print errors and warnings, write the results; returns 0.
 
         Raises:
             ValueError: no recording, one that cannot be read or used, a value out of range.
@@ -54,13 +54,13 @@ class Identify:
         sets = [read_recording(path) for path in self.recordings]
         default = Path("runs") / f"identify-{sets[0].name}"
         with output_folder(self.out or default, results.RESULT_NAMES, numbered=self.out is None) as files:
-            found = identify(sets, options, console=console)
-            results.write_material(found, files / results.MATERIAL_NAME, self.command_line)
-            results.write_sites(found, files / results.SITES_NAME)
-            results.write_curves(found, files / results.CURVES_NAME)
-            has_map = results.write_map(found, files / results.MAP_NAME)
-            results.write_summary(found, files / results.SUMMARY_NAME, self.command_line)
-        results.print_result(found, console)
+            result = identify(sets, options, console=console)
+            results.write_material(result, files / results.MATERIAL_NAME, self.command_line)
+            results.write_sites(result, files / results.SITES_NAME)
+            results.write_curves(result, files / results.CURVES_NAME)
+            has_map = results.write_map(result, files / results.MAP_NAME)
+            results.write_summary(result, files / results.SUMMARY_NAME, self.command_line)
+        results.print_result(result, console)
         written = [name for name in results.RESULT_NAMES if has_map or name != results.MAP_NAME]
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0

@@ -71,7 +71,7 @@ class Organ:
         from surgsim_apps.palpate.scene_options import SceneOptions
         from surgsim_apps.patient import make_patient as patient
         from surgsim_apps.patient.label_image import IMAGE_SUFFIXES, is_image
-        from surgsim_apps.patient.retract_scene import told
+        from surgsim_apps.patient.retract_scene import retraction_text
 
         if not self.files:
             raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
@@ -95,7 +95,7 @@ class Organ:
             patient.check_target(self.out)
         out = self.out or Path("patient.vtu")
         with StepProgress(console) as progress:
-            found = patient.make_patient(
+            organ = patient.make_patient(
                 self.files,
                 out,
                 labels=self.labels,
@@ -113,14 +113,14 @@ class Organ:
                 moduli=_moduli(self.modulus),
                 progress=progress,
             )
-            found = patient.with_hold(found, progress)
+            organ = patient.with_hold(organ, progress)
             with progress.step("seeking an edge to lift"):
-                found, retraction = patient.add_retraction(found, out)
-            patient.print_patient(found, console)
-            console.print(f"retraction: {told(retraction)}", highlight=False)
+                organ, retraction = patient.add_retraction(organ, out)
+            patient.print_patient(organ, console)
+            console.print(f"retraction: {retraction_text(retraction)}", highlight=False)
             if self.out is not None:
                 written = patient.write_patient(
-                    found, self.out, self.command_line, retraction, healthy_map=self.healthy_map, progress=progress
+                    organ, self.out, self.command_line, retraction, healthy_map=self.healthy_map, progress=progress
                 )
                 console.print(f"written: {', '.join(map(str, written))}", highlight=False, soft_wrap=True)
         return 0

@@ -14,18 +14,11 @@ from surgsim_apps.cli.values import (
     vector_of,
 )
 from surgsim_apps.palpate.figures import write_stiffness_map
-from surgsim_apps.palpate.job import (
-    CSV_NAME,
-    MODEL_MODULUS_ERROR,
-    PICTURE_NAME,
-    SUMMARY_NAME,
-    plan_sites,
-    print_report,
-    run_palpation,
-    write_csv,
-    write_summary,
-)
-from surgsim_apps.palpate.scene_options import SceneOptions, load_stable_anatomy, with_options
+from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, load_stable_anatomy, run_palpation
+from surgsim_apps.palpate.report import print_report
+from surgsim_apps.palpate.results import CSV_NAME, PICTURE_NAME, SUMMARY_NAME, write_csv, write_summary
+from surgsim_apps.palpate.scene_options import SceneOptions, with_options
+from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.scene import Anatomy, Ball, Vector, load_anatomy, load_scene, make_scene
 from surgsim_env.step_progress import StepProgress
@@ -83,21 +76,22 @@ class Palpate:
         names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
         default = Path("runs") / f"palpate-{scene.name}"
         with output_folder(self.out or default, names, numbered=self.out is None) as files:
-            with StepProgress(console) as progress, progress.step("preparing the organ"):
-                anatomy = load_anatomy(scene)
-                lesions = anatomy.demonstration_lesions()
-                if asked or below:
-                    places = [*asked, *(_below_site(anatomy, *one) for one in below)]
-                    lesions = [anatomy.lesion_at(*one, f"lesion {n}") for n, one in enumerate(places, start=1)]
-                    for lesion in lesions:
-                        anatomy.check_inside(lesion)
-                anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-            found = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, console=console)
-            with StepProgress(console) as progress, progress.step("drawing the map"):
-                write_csv(found, files / CSV_NAME)
-                write_summary(found, files / SUMMARY_NAME, vars(self))
-                write_stiffness_map(found, files / PICTURE_NAME)
-        print_report(found, console)
+            with StepProgress(console) as progress:
+                with progress.step("preparing the organ"):
+                    anatomy = load_anatomy(scene)
+                    lesions = anatomy.demonstration_lesions()
+                    if asked or below:
+                        places = [*asked, *(_below_site(anatomy, *lesion) for lesion in below)]
+                        lesions = [anatomy.lesion_at(*place, f"lesion {n}") for n, place in enumerate(places, start=1)]
+                        for lesion in lesions:
+                            anatomy.check_inside(lesion)
+                    anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+                palpation = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, progress=progress)
+                with progress.step("drawing the map"):
+                    write_csv(palpation, files / CSV_NAME)
+                    write_summary(palpation, files / SUMMARY_NAME, vars(self))
+                    write_stiffness_map(palpation, files / PICTURE_NAME)
+        print_report(palpation, console)
         console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
         return 0
 

@@ -1,4 +1,4 @@
-"""The table on the terminal, `validation.md` with its plots and `validation.csv`, all from one run."""
+"""Report of a validation: the table on the terminal, `validation.md`, its plots and `validation.csv`."""
 
 import csv
 import math
@@ -40,12 +40,12 @@ Rows without a tolerance have a bound on one side.
 
 
 def verdict(validation: Validation, row: Row) -> str:
-    """The row's verdict, "known" for a listed shortfall."""
+    """Verdict of a row, "known" for a listed shortfall."""
     return "known" if validation.is_known(row) else row.verdict
 
 
 def cells(validation: Validation, row: Row) -> tuple[str, ...]:
-    """The row as text, in the order of HEADINGS."""
+    """Texts of a row, in the order of HEADINGS."""
     return (
         row.case,
         row.source,
@@ -81,7 +81,7 @@ def summary(validation: Validation) -> str:
 
 
 def print_report(validation: Validation, console: Console) -> None:
-    """Print the table, the reasons of rows that are not met, and the summary."""
+    """Print the table, the reasons of rows not met, and the summary."""
     table = Table()
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if heading in HEADINGS[2:6] else "left", overflow="fold")
@@ -173,7 +173,7 @@ def write_plot(curves: list[Curve], path: Path) -> None:
     axes = figure.add_subplot()
     colour = "C0"
     for curve in curves:
-        # A reference is dashed and has the colour of the line before it, which is compared with it.
+        # A reference is dashed and has the colour of the compared line before it.
         dashed = curve.label.startswith(REFERENCES)
         style, chosen = ("--", colour) if dashed else ("o-", None)
         (line,) = axes.plot(curve.x, curve.y, style, color=chosen, label=curve.label, markersize=4)

@@ -14,15 +14,9 @@ from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.ports import Ports
-from surgsim_apps.arms.results import (
-    QUANTITIES,
-    ArmsEvaluation,
-    Quantity,
-    share_text,
-    sides,
-    values_of,
-    worse_of_both,
-)
+from surgsim_apps.arms.quantities import QUANTITIES, Quantity
+from surgsim_apps.arms.results import ArmsEvaluation
+from surgsim_apps.arms.wording import share_text
 from surgsim_apps.reports.html_page import Picture
 from surgsim_apps.reports.output_folder import AnyFolder
 from surgsim_apps.reports.surface_drawing import (
@@ -131,8 +125,8 @@ class ArmMaps:
 
     def _write_quantity(self, folder: AnyFolder, quantity: Quantity) -> Picture:
         one = self.evaluation
-        panels = [(f"{side} arm", arm.reachable, values_of(arm, quantity)) for side, arm in sides(one)]
-        panels.append(("both at once, the worse arm", one.both, worse_of_both(one, quantity)))
+        panels = [(f"{side} arm", arm.reachable, quantity.values(arm)) for side, arm in one.arms.items()]
+        panels.append(("both at once, the worse arm", one.both, quantity.worse_of_both(one)))
         name = f"map_{quantity.field}.png"
         sense = "more is better" if quantity.more_is_better else "less is better"
         label = f"{quantity.label}\n{sense}"

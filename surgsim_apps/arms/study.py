@@ -12,36 +12,22 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.pictures import ArmMaps, draw_arms, write_picture
+from surgsim_apps.arms.points_file import write_points
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
+from surgsim_apps.arms.quantities import QUANTITIES
+from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.reach import (
     Sites,
     evaluate_both,
     evaluate_reach,
     tip_ball,
 )
-from surgsim_apps.arms.results import (
-    DISTANCES,
-    QUANTITIES,
-    RANKING_RULE,
-    REASONS,
-    SHARE_DEFINITIONS,
-    SIDES,
-    ArmsEvaluation,
-    Ranked,
-    number_text,
-    rank,
-    share_text,
-    sides,
-    spread,
-    values_of,
-    verdict,
-    worse_of_both,
-    write_points,
-)
-from surgsim_apps.arms.through_cycle import cycle_section, evaluate_cycle
-from surgsim_apps.reports.html_page import Picture, render_page
+from surgsim_apps.arms.report import write_report
+from surgsim_apps.arms.results import ArmsEvaluation
+from surgsim_apps.arms.through_cycle import evaluate_cycle
+from surgsim_apps.arms.wording import verdict
 from surgsim_apps.reports.output_folder import AnyFolder
-from surgsim_env.instruments import load_arm
+from surgsim_env.instruments import SIDES, load_arm
 from surgsim_env.rendering import NoGLError
 from surgsim_env.scene import Anatomy, ArmDescription, Scene, load_anatomy, make_scene
 from surgsim_env.step_progress import StepProgress
@@ -54,7 +40,6 @@ RESULT_NAMES = (
     *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, "map_reach.png"),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
 )
-Rows = list[tuple[str, ...]]
 
 
 def evaluate_arms(
@@ -260,84 +245,3 @@ def run_study(
     write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
     console.print(verdict(first), highlight=False)
     return [REPORT_NAME, POINTS_NAME, *(one.name for one in (*pictures, *maps))]
-
-
-def write_report(
-    evaluation: ArmsEvaluation,
-    path: Path,
-    *,
-    pictures: Sequence[Picture],
-    maps: Sequence[Picture],
-    command: str,
-    ranking: Sequence[Ranked] = (),
-) -> None:
-    """Write the report.
-
-    Args:
-        evaluation: what was found.
-        path: of the file.
-        pictures: of the arms in the patient.
-        maps: heat maps.
-        command: the command that makes this report.
-        ranking: of several placements or robots; left out if there is none.
-    """
-    page = render_page(
-        "arms.html.j2",
-        title=f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)",
-        verdict=verdict(evaluation),
-        ranking=ranking,
-        ranking_rule=RANKING_RULE,
-        number_text=number_text,
-        pictures=pictures,
-        maps=maps,
-        has_targets=evaluation.inner.any(),
-        shares=_shares(evaluation),
-        values=_values(evaluation),
-        distances=[(title, *spread(getattr(evaluation, field)).texts(1e3, 1)) for field, title, _ in DISTANCES],
-        reasons=_reasons(evaluation),
-        cycle=cycle_section(evaluation),
-        definitions=_definitions(),
-        command=command,
-    )
-    path.write_text(page, encoding="utf-8", newline="\n")
-
-
-def _shares(evaluation: ArmsEvaluation) -> Rows:
-    """Shares of points that the left arm, the right arm and both at once reach."""
-    groups = [("on the surface", ~evaluation.inner), ("inside the organ", evaluation.inner)]
-    masks = [evaluation.left.reachable, evaluation.right.reachable, evaluation.both]
-    return [
-        (f"{name} ({int(group.sum())} points)", *(share_text(mask[group]) for mask in masks))
-        for name, group in groups
-        if group.any()
-    ]
-
-
-def _values(evaluation: ArmsEvaluation) -> list[tuple[str, list[tuple[str, str, str]]]]:
-    """Least, median and greatest of each quantity for each arm, and for the worse arm where both reach at once."""
-    rows = []
-    for quantity in QUANTITIES:
-        groups = [values_of(arm, quantity) for _, arm in sides(evaluation)]
-        groups.append(worse_of_both(evaluation, quantity))
-        rows.append((quantity.label, [spread(values).texts(quantity.scale, quantity.digits) for values in groups]))
-    return rows
-
-
-def _reasons(evaluation: ArmsEvaluation) -> Rows:
-    """Numbers and shares of points by their reason, for both arms."""
-    rows = []
-    for index, reason in enumerate(REASONS):
-        masks = [arm.reason == index for _, arm in sides(evaluation)]
-        rows.append((reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
-    return rows
-
-
-def _definitions() -> list[tuple[str, str]]:
-    """Names of all figures of an evaluation and what they mean."""
-    return [
-        ("reachable", SHARE_DEFINITIONS[0][1]),
-        ("both at once", SHARE_DEFINITIONS[1][1]),
-        *((quantity.label, quantity.definition) for quantity in QUANTITIES),
-        *((f"{title} [mm]", definition) for _, title, definition in DISTANCES),
-        ("the worse arm", "At a point, the smaller of both arms' values where more is better, else the larger."),
-    ]

@@ -7,7 +7,6 @@ Ports, body wall and endoscope stay.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +25,7 @@ from surgsim_apps.arms.reach import (
     pair_distances,
     ways,
 )
-from surgsim_apps.arms.results import (
-    ArmsEvaluation,
-    ArmThroughCycle,
-    ThroughCycle,
-    number_text,
-)
+from surgsim_apps.arms.results import ArmThroughCycle, ThroughCycle
 from surgsim_env.scene import Anatomy, CyclicMotion
 from surgsim_env.step_progress import StepProgress
 
@@ -221,62 +215,3 @@ def _together(
         for joints, changed in zip(pairs[to], (left, right), strict=True):
             joints[rows[good]] = changed[good]
     return both
-
-
-def _worst_and_median(values: FloatArray) -> dict[str, float]:
-    """The least of all points and positions; the median over the points of each one's least, and of its median."""
-    known = values[:, np.isfinite(values).all(axis=0)]
-    if not known.size:
-        return dict.fromkeys(("worst", "median_of_worst", "median"), math.nan)
-    each = known.min(axis=0)
-    return {
-        "worst": float(each.min()),
-        "median_of_worst": float(np.median(each)),
-        "median": float(np.median(np.median(known, axis=0))),
-    }
-
-
-def cycle_section(evaluation: ArmsEvaluation) -> dict[str, Any] | None:
-    """Contents of the report's section on the cycle; None for a patient who holds still."""
-    cycle, outer = evaluation.cycle, ~evaluation.inner
-    if cycle is None:
-        return None
-    parts = [
-        f"{name} by up to {_millimetres(travel)} in cycles of {period:.2g} s"
-        for name, travel, period in zip(cycle.motions, cycle.travel, cycle.period, strict=True)
-    ]
-    return {
-        "motions": ", ".join(parts),
-        "positions": len(cycle.both),
-        "reach": _reach_rows(cycle, outer),
-        "clearance": _clearance_rows(cycle, outer),
-    }
-
-
-def _reach_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
-    """Shares of points at rest, median and least over the positions, at every position, and with a path."""
-    rows = [(f"{side} arm", arm.reachable, _per_cent(float(arm.has_path[outer].mean()))) for side, arm in cycle.arms]
-    rows.append(("both at once", cycle.both, ""))
-    texts = []
-    for name, reachable, path in rows:
-        each = reachable[:, outer]
-        share = each.mean(axis=1)
-        figures = (share[0], float(np.median(share)), float(share.min()), float(each.all(axis=0).mean()))
-        texts.append((name, *map(_per_cent, figures), path))
-    return texts
-
-
-def _clearance_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
-    rows = []
-    for side, arm in cycle.arms:
-        found = _worst_and_median(arm.clearance[:, outer])
-        rows.append((f"{side} arm: clearance [mm]", *(number_text(one, 1e3, 2) for one in found.values())))
-    return rows
-
-
-def _millimetres(value: float) -> str:
-    return number_text(value, 1e3, 1, "mm")
-
-
-def _per_cent(share: float) -> str:
-    return number_text(share, 100.0, 0, "%")

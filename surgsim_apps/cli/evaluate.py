@@ -52,5 +52,5 @@ class Evaluate:
             elif self.all:
                 evaluate.evaluate_all(options, console)
             elif self.compare is not None:
-                evaluate.print_comparison(*self.compare, console)
+                evaluate.print_comparison(self.compare, console)
         return 0

@@ -470,9 +470,9 @@ class HapticLoop:
 
     def _hold_breath(self) -> None:
         """Hold the breath while a device's button does; a device without a pose asks for nothing."""
-        asked = [held.holds_breath for held in self.held]
-        if any(one is not None for one in asked):
-            self.simulation.hold_breath(any(asked))
+        requests = [held.holds_breath for held in self.held]
+        if any(request is not None for request in requests):
+            self.simulation.hold_breath(any(requests))
 
     def _contact_forces(self) -> list[FloatArray]:
         wrench = self.simulation.contact_wrench

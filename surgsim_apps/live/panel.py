@@ -127,7 +127,7 @@ class Panel:
                 top *= 2.0
             if plot.scales["y"]["max"] != top:
                 plot.scales = _scales(top)
-            plot.data = (since, *(np.ascontiguousarray(one) for one in values.T))
+            plot.data = (since, *(np.ascontiguousarray(curve) for curve in values.T))
 
     def _add_buttons(self) -> None:
         calls = self._calls
@@ -142,15 +142,15 @@ class Panel:
         kinds = lesion_kinds(scene)
         self._lesions = gui.add_dropdown("Lesions", kinds, initial_value=kinds[0])
         ratio = max(
-            (one.modulus_ratio for one in scene.demonstration),
+            (lesion.modulus_ratio for lesion in scene.demonstration),
             default=scene.lesion.modulus_ratio[1] if scene.lesion else 8.0,
         )
         self._ratio = self._slider("Lesions' modulus / tissue's", 1.0, 12.0, 0.5, min(float(ratio), 12.0))
         self._size = self._slider("Lesions' size", 0.5, 1.3, 0.05, 1.0)
         hide = self._button("Hide another lesion", "draw one from the scene's ranges", self._hide)
         hide.visible = HIDDEN in kinds
-        for one in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
-            one.on_update(lambda _: self._choose())
+        for control in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
+            control.on_update(lambda _: self._choose())
         self._checkbox("Show lesions", "show_lesions")
 
     def _choose(self, **changes: Any) -> None:
@@ -268,9 +268,9 @@ def status_rows(
         said: message of the page, shown when the physics has none.
         has_breath: whether the patient has a breath that can be held.
     """
-    force = " / ".join(f"{float(np.linalg.norm(one)):.2f}" for one in frame["force"])
+    forces = " / ".join(f"{float(np.linalg.norm(force)):.2f}" for force in frame["force"])
     rows = [
-        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{force} N"),
+        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{forces} N"),
         ("simulated time", f"{float(frame['time']):.1f} s"),
         ("physics", f"{kept.rate:.0f} steps/s"),
         ("real-time factor", f"{kept.real_time:.3f}"),

@@ -241,18 +241,18 @@ class Physics:
             self._recordings += 1
         self._recording = on
 
-    def _record_step(self, told: HapticTelemetry) -> None:
+    def _record_step(self, telemetry: HapticTelemetry) -> None:
         """Add a step to the trace and the recording, and react to faults."""
         exchange, simulation = self._exchange, self._simulation
-        for arm, tip in enumerate(told.tips):
+        for arm, tip in enumerate(telemetry.tips):
             x, y, z = tip.contact_force.tolist()
             self._peak[arm] = max(self._peak[arm], (x * x + y * y + z * z) ** 0.5)
-        step = round(told.time / simulation.haptic_dt)
+        step = round(telemetry.time / simulation.haptic_dt)
         if step % TRACE_STEPS == 0:
             with exchange.trace.writing() as trace:
                 row = trace["row"][int(trace["count"]) % TRACE_LENGTH]
-                row["time"] = told.time
-                for arm, tip in enumerate(told.tips):
+                row["time"] = telemetry.time
+                for arm, tip in enumerate(telemetry.tips):
                     row["tip"][arm] = tip.tip - simulation.ground_shift(tip.tip)
                     row["depth"][arm], row["force"][arm] = tip.depth, tip.contact_force
                 row["peak"] = self._peak
@@ -264,18 +264,18 @@ class Physics:
             else:
                 poses = [hand.pose for hand in self._hands]
                 places = np.array([np.full(3, np.nan) if pose is None else pose.position for pose in poses])
-                tips = np.array([tip.tip for tip in told.tips])
+                tips = np.array([tip.tip for tip in telemetry.tips])
                 buttons = [0 if pose is None else pose.buttons for pose in poses]
                 exchange.recorded.append(
-                    told.time, places, buttons, tips, np.array([tip.contact_force for tip in told.tips])
+                    telemetry.time, places, buttons, tips, np.array([tip.contact_force for tip in telemetry.tips])
                 )
-        if told.fault:
-            self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
+        if telemetry.fault:
+            self._phase, self._said, self._recording = Phase.FAULT, telemetry.fault, False
             self._write_frame()
 
     def _write_frame(self) -> None:
         """Write a frame for the page."""
-        simulation, told = self._simulation, self._last
+        simulation, telemetry = self._simulation, self._last
         data = simulation.instrument.data
         with self._exchange.frame.writing() as frame:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
@@ -283,7 +283,7 @@ class Physics:
             frame["breath_held"] = simulation.holds_breath
             frame["time"], frame["said"] = simulation.time, self._said.encode()
             frame["added_mass"] = self._organ.added_mass
-            for arm, tip in enumerate(told.tips):
+            for arm, tip in enumerate(telemetry.tips):
                 frame["tip"][arm] = self._loop.held[arm].drive.tool.tip_position
                 frame["force"][arm] = tip.contact_force
             frame["node"] = simulation.organ_state.node_position[:, :3]

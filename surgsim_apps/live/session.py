@@ -130,11 +130,11 @@ class Session:
         """
         if self.alive:
             return
-        said = ""
+        reason = ""
         # Other errors were printed by Python.
         with contextlib.suppress(EOFError, OSError):
-            said = self._pipe.recv() if self._pipe.poll() else ""
-        why = said or f"exit code {self._process.exitcode}; its own message, if any, stands above"
+            reason = self._pipe.recv() if self._pipe.poll() else ""
+        why = reason or f"exit code {self._process.exitcode}; its own message, if any, stands above"
         raise LiveError(f"the physics' process died: {why}")
 
     def frame(self) -> NDArray[Any]:

@@ -350,9 +350,9 @@ def _add(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> Any:
             name, radius=float(size[0]), height=float(2.0 * size[1]), color=colour, radial_segments=24
         )
     if kind == "CAPSULE":
-        made = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[20, 20])
-        made.apply_translation(-made.bounds.mean(axis=0))
-        vertices, faces = made.vertices, made.faces
+        capsule = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[20, 20])
+        capsule.apply_translation(-capsule.bounds.mean(axis=0))
+        vertices, faces = capsule.vertices, capsule.faces
     else:
         mesh = int(model.geom_dataid[geom])
         vertices, faces = mesh_rows(model, mesh, "vert") * SCALE, mesh_rows(model, mesh, "face")

@@ -18,7 +18,7 @@ from surgsim_env.scene import Scene
 PLOTTED, PLOT_POINTS = 10.0, 250
 # Smallest upper end of a plot's scale; it doubles as needed.
 PLOT_LEAST = {"N": 0.5, "mm": 4.0}
-# A change applies when the sliders have not moved for this long [s].
+# Time without a motion of the sliders before a change applies [s].
 SETTLED = 0.35
 BUTTON_COLOUR = (52, 84, 96)
 ARM_COLOURS = ("#e8590c", "#1971c2")
@@ -45,7 +45,7 @@ class Panel:
     """The panel beside the picture. viser's threads call the callbacks.
 
     Fields:
-        choice: the organ that the sliders describe
+        choice: the organ of the sliders
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Panel:
             gui: viser's.
             scene: of the session.
             arm_count: 1 or 2.
-            has_jaw: whether the first arm has a jaw.
+            has_jaw: True if the first arm has a jaw.
             calls: callbacks by name: pause() and record(), which toggle;
                 reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), hold_breath(on), plain(on).
         """
@@ -90,7 +90,7 @@ class Panel:
             gui.add_markdown(STEERING.format(second=second, jaw=jaw))
 
     def settled_choice(self) -> OrganChoice | None:
-        """The organ that the sliders describe, once they have stopped moving; None otherwise."""
+        """The organ of the sliders, once they have stopped moving; None otherwise."""
         if self._changed is None or time.monotonic() - self._changed < SETTLED:
             return None
         self._changed = None
@@ -101,7 +101,7 @@ class Panel:
         self._status.content = _status_html(headline(frame), rows)
 
     def show_phase(self, frame: NDArray[Any], recorded: float, *, jaw_closed: bool, breath_held: bool) -> None:
-        """Label the buttons with what a click will do; `recorded` is the length of the recording [s]."""
+        """Label the buttons with the effect of a click; `recorded` is the length of the recording [s]."""
         recording = bool(frame["recording"])
         _set(self._jaw, "value", jaw_closed)
         _set(self._breath, "value", breath_held)
@@ -180,15 +180,15 @@ class Panel:
         button.on_click(lambda _: clicked())
         return button
 
-    def _checkbox(self, label: str, name: str, *, initial_value: bool = False, **given: Any) -> Any:
-        """A check box that calls the callback of some name with its value."""
-        box = self._gui.add_checkbox(label, initial_value=initial_value, **given)
+    def _checkbox(self, label: str, name: str, *, initial_value: bool = False, **options: Any) -> Any:
+        """A check box for the callback of a name."""
+        box = self._gui.add_checkbox(label, initial_value=initial_value, **options)
         box.on_update(lambda _: self._calls[name](box.value))
         return box
 
 
 def _set(handle: Any, name: str, value: object) -> None:
-    """Set an attribute of an element if it differs: viser sends each one that is set."""
+    """Set an attribute of an element if it differs: viser sends every assignment."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)
 
@@ -255,7 +255,7 @@ def status_rows(
     *,
     skipped: int,
     fps: float,
-    said: str,
+    message: str,
     has_breath: bool = False,
 ) -> list[tuple[str, str]]:
     """Names with values, as HTML.
@@ -265,8 +265,8 @@ def status_rows(
         kept: timing of the steps since the last call.
         skipped: steps skipped since the start.
         fps: pictures sent [1/s].
-        said: message of the page, shown when the physics has none.
-        has_breath: whether the patient has a breath that can be held.
+        message: of the page, shown if the physics has none.
+        has_breath: True if the patient can hold the breath.
     """
     forces = " / ".join(f"{float(np.linalg.norm(force)):.2f}" for force in frame["force"])
     rows = [
@@ -283,7 +283,7 @@ def status_rows(
         rows.insert(2, ("breath", "held" if frame["breath_held"] else "goes on"))
     if float(frame["added_mass"]) > 0.0:
         rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
-    words = bytes(frame["said"]).decode("utf-8", "replace") or said
+    words = bytes(frame["message"]).decode("utf-8", "replace") or message
     if words:
         rows.append(("", html.escape(words)))
     return rows

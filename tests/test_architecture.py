@@ -430,7 +430,10 @@ def test_allowed_source_passes(rule, path, text):
 
 @pytest.mark.parametrize(
     ("package", "unwanted"),
-    [("msdm_core", HEAVY | {"mujoco", "gymnasium", "surgsim_env"}), ("surgsim_env", HEAVY | {"rich"})],
+    [
+        ("msdm_core", HEAVY | {"mujoco", "gymnasium", "surgsim_env"}),
+        ("surgsim_env", HEAVY | {"rich", "surgsim_apps"}),
+    ],
 )
 def test_import_stays_light(package, unwanted):
     """In a fresh interpreter, the package brings none of the heavy libraries."""

@@ -49,7 +49,7 @@ class PalpateExpert:
             raise ValueError(f"this expert slides on a block's flat top; {scene.name!r} is not a block: use phantom")
         if task.memory is None:
             raise ValueError("this expert reads the memory of the observation: make the environment with memory=True")
-        self.env, self.slices = single, task.observation_slices
+        self.env, self.slices = single, single.observation_slices
         self.chart = task.memory.chart
         self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
         self.force_most = FORCE_SHARE * scene.limits.soft_force

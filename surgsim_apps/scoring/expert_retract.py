@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import arctan2, norm
-from surgsim_env.tasks import RetractTask
+from surgsim_env.tasks import RetractTask, channel_slices
 
 # Entries of the observation, of an instrument with one hinge: channels of numbers and vectors, then single numbers.
-SLICES = RetractTask.channel_slices(tip_axes=6)
+SLICES = channel_slices(RetractTask, tip_axes=6)
 TIP, EDGE, TARGET = (SLICES[name] for name in ("tip_position", "edge_points", "target_place"))
 POINTS_ALONG = slice(SLICES["tip_axes"].start + 3, SLICES["tip_axes"].stop)
 GAP, GRIP, PULL, HOLDS, VISIBLE = (

@@ -403,7 +403,7 @@ def press_sites(
     def press(own: LaneGroup, number: int) -> list[float]:
         batch = batches[number]
         presses = [SitePress(one, site.point, site.normal) for one, site in zip(own.simulations, batch, strict=False)]
-        press_in_lanes(own, [*presses, *[None] * (lanes - len(presses))], phases)
+        press_in_lanes(own, presses, phases)
         advance(len(batch))
         return [_stiffness(anatomy, one) for one in presses]
 

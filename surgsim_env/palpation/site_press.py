@@ -208,8 +208,9 @@ class SitePress:
         self._velocity = (self._tracker.displacement(duration) - self._carried) / duration
         return self._velocity
 
-    def end(self, phase: PressPhase, force_peak: float) -> None:
-        """Record an executed phase and its largest contact force [N]."""
+    def end(self, phase: PressPhase) -> None:
+        """Record an executed phase."""
+        force_peak = self.simulation.force_peak
         self.force_peak = max(self.force_peak, force_peak)
         self._limited |= self.simulation.instrument.workspace_limited
         if self.simulation.fault or not self.simulation.end_control_step():
@@ -241,20 +242,18 @@ def press_alone(press: SitePress, phases: Sequence[PressPhase]) -> PressResult:
     """Execute a press with its simulation alone."""
     for phase in phases:
         if press.begin(phase):
-            press.end(phase, press.simulation.control_step(phase.count, phase.force_limit))
+            press.simulation.control_step(phase.count, phase.force_limit)
+            press.end(phase)
     return press.result()
 
 
-def press_in_lanes(group: LaneGroup, presses: Sequence[SitePress | None], phases: Sequence[PressPhase]) -> None:
-    """Execute one press with each simulation of a group side by side, None for none; `SitePress.result` has each."""
+def press_in_lanes(group: LaneGroup, presses: Sequence[SitePress], phases: Sequence[PressPhase]) -> None:
+    """Execute presses with simulations of a group side by side; `SitePress.result` has each."""
     for phase in phases:
-        moving = [press for press in presses if press is not None and press.begin(phase)]
-        if not moving:
-            continue
-        group.control_step(np.array([press in moving for press in presses]), phase.count, phase.force_limit)
+        if moving := [press for press in presses if press.begin(phase)]:
+            group.control_step([press.simulation for press in moving], phase.count, phase.force_limit)
         for press in moving:
-            # The group has advanced it: this only reports the largest force.
-            press.end(phase, press.simulation.control_step(phase.count, phase.force_limit))
+            press.end(phase)
 
 
 def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press:

@@ -136,30 +136,9 @@ class Level:
         capsule = 0.0
         if anatomy.scene.capsule is None and rng.random() < self.capsule_share:
             capsule = float(rng.uniform(*CAPSULE_STIFFNESS))
-        for _ in range(TRIES_MOST):
-            lesions = self._lesions(anatomy, rng, count, background)
-            if lesions is not None:
-                return DrawnOrgan(tuple(lesions), background, capsule)
-        raise ValueError(
-            f"scene {anatomy.scene.name!r}: {count} lesions of level {self.name!r} found no room beside each other in "
-            f"{TRIES_MOST} draws: use smaller lesions, or a larger palpable face"
-        )
-
-    def _lesions(
-        self, anatomy: Anatomy, rng: np.random.Generator, count: int, background: float
-    ) -> list[Lesion] | None:
-        """Draw lesions apart from each other; None if one of them finds no place in PLACES_MOST draws."""
-        ranges, lesions = self.lesion_draw(anatomy.scene), []
-        gap = LESION_GAP * anatomy.scene.instrument.tip_radius / REFERENCE_TIP
-        for number in range(count):
-            for _ in range(PLACES_MOST):
-                lesion = anatomy.random_lesion(rng, ranges, modulus_factor=background)
-                if _apart(lesion, lesions, gap):
-                    lesions.append(replace(lesion, name=f"lesion {number + 1}"))
-                    break
-            else:
-                return None
-        return lesions
+        place = f"level {self.name!r} of scene {anatomy.scene.name!r}"
+        lesions = _draw_lesions(anatomy, self.lesion_draw(anatomy.scene), rng, count, background, place)
+        return DrawnOrgan(lesions, background, capsule)
 
 
 @dataclass(frozen=True)
@@ -175,6 +154,31 @@ class DrawnOrgan:
     lesions: tuple[Lesion, ...]
     background: float = 1.0
     capsule_stiffness: float = 0.0
+
+    @classmethod
+    def draw(
+        cls,
+        anatomy: Anatomy,
+        rng: np.random.Generator,
+        level: Level | None = None,
+        lesion_count: int | tuple[int, int] | None = None,
+    ) -> "DrawnOrgan":
+        """Draw the organ of an episode.
+
+        Args:
+            anatomy: of a scene made by the level's `scene`.
+            rng: source of random numbers.
+            level: of the lesions; None for the scene's own ranges.
+            lesion_count: number of lesions, or its least and most; None: drawn by the level, without a level none.
+
+        Raises:
+            ValueError: lesions of a scene without a [lesion] table, or TRIES_MOST draws find no room for them.
+        """
+        count = int(rng.integers(*lesion_count, endpoint=True)) if isinstance(lesion_count, tuple) else lesion_count
+        if level is not None:
+            return level.draw(anatomy, rng, lesion_count=count)
+        place = f"scene {anatomy.scene.name!r}"
+        return cls(_draw_lesions(anatomy, anatomy.scene.lesion, rng, count or 0, 1.0, place))
 
     def compiled(self, anatomy: Anatomy) -> OrganModel:
         """The compiled organ of an anatomy with everything that was drawn."""
@@ -205,6 +209,29 @@ class DrawnOrgan:
             for n, numbers in enumerate(saved["lesions"])
         ]
         return cls(tuple(lesions), saved["background"], saved["capsule_stiffness"])
+
+
+def _draw_lesions(
+    anatomy: Anatomy, ranges: LesionDraw | None, rng: np.random.Generator, count: int, background: float, place: str
+) -> tuple[Lesion, ...]:
+    """Draw lesions apart from each other, in tissue of a modulus factor; `place` names their origin in an error."""
+    gap = LESION_GAP * anatomy.scene.instrument.tip_radius / REFERENCE_TIP
+    for _ in range(TRIES_MOST):
+        lesions: list[Lesion] = []
+        for _ in range(count):
+            for _ in range(PLACES_MOST):
+                lesion = anatomy.random_lesion(rng, ranges, modulus_factor=background)
+                if _apart(lesion, lesions, gap):
+                    lesions.append(replace(lesion, name=f"lesion {len(lesions) + 1}"))
+                    break
+            else:
+                break
+        if len(lesions) == count:
+            return tuple(lesions)
+    raise ValueError(
+        f"{place}: {count} lesions found no room beside each other in {TRIES_MOST} draws: use smaller or fewer "
+        "lesions, or a larger palpable face"
+    )
 
 
 def _share(bounds: Range, share: Range) -> Range:

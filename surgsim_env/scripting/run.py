@@ -14,7 +14,7 @@ from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.scripting.observations import stacked_observations
 from surgsim_env.scripting.steps import Action, Control, MayEnd, Script, Step, StepFailed, View
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
-from surgsim_env.tasks.task import Task
+from surgsim_env.tasks.layout import TaskLayout
 
 
 class ScriptError(Exception):
@@ -43,17 +43,17 @@ def run_script(env: gym.Env, script: Script, *, seed: int | None = None) -> Trac
         ValueError: an empty script, two steps of one name, a speed or an action beyond what the environment takes.
     """
     inner = _inner(env)
-    task: Task = inner.task
+    layout = inner.layout
     names = _names(script)
     for step, name in zip(script, names, strict=True):
-        if step.speed > task.speed_limit * (1.0 + 1e-9):
+        if step.speed > layout.speed_limit * (1.0 + 1e-9):
             raise ValueError(
                 f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
-                f"{task.speed_limit:g} m/s: ask for that or less"
+                f"{layout.speed_limit:g} m/s: ask for that or less"
             )
     observation = inner.observation if seed is None else env.reset(seed=seed)[0]
     with inner.simulation.recording() as record:
-        run = _Run(env, inner, task, record, observation, inner.simulation.time)
+        run = _Run(env, inner, layout, record, observation, inner.simulation.time)
         failure = ""
         for index, (step, name) in enumerate(zip(script, names, strict=True)):
             began = inner.simulation.time
@@ -76,7 +76,7 @@ class _Run:
 
     env: gym.Env
     inner: SurgicalEnv
-    task: Task
+    layout: TaskLayout
     record: HapticRecord
     observation: Observation
     start: float
@@ -129,7 +129,7 @@ class _Run:
             depth=contact_depth(record.wrench, record.tip_position, simulation.anatomy.face.approach),
             control_time=np.array(self.times),
             observation=stacked_observations(self.env.observation_space, self.observations),
-            action=np.array(self.actions) if self.times else np.zeros((0, self.task.action_size)),
+            action=np.array(self.actions) if self.times else np.zeros((0, self.layout.action_size)),
             reward=np.array(self.rewards),
             infos=tuple(self.infos),
             steps=tuple(self.steps),
@@ -152,11 +152,11 @@ class _Run:
             tip_velocity=instrument.tip_velocity,
             true_force=simulation.contact_force,
             # As no wrapper or picture has changed it.
-            sensed_force=self.task.sensed_force(self.inner.task_observation),
+            sensed_force=self.layout.sensed_force(self.inner.task_observation),
             contact_position=None if touched is None else self.record.tip_position_at(touched),
             approach=simulation.anatomy.face.approach.copy(),
             grasp=simulation.grasp,
-            task=self.task,
+            layout=self.layout,
         )
         if not isinstance(instrument, Pair):
             return view
@@ -214,7 +214,7 @@ def _inner(env: gym.Env) -> SurgicalEnv:
     inner = env.unwrapped
     if not isinstance(inner, SurgicalEnv):
         raise TypeError(f'{type(inner).__name__} is no environment of this project: use gym.make("SurgSim/Palpate-v0")')
-    if "velocity" not in inner.task.action_slices or "contact_force" not in inner.task.observation_slices:
+    if "velocity" not in inner.layout.action_slices or "contact_force" not in inner.layout.observation_slices:
         raise TypeError(
             f"{type(inner.task).__name__} cannot be scripted: steps command `velocity` and sense `contact_force`; "
             "declare a command and a channel of these names"

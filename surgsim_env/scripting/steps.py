@@ -16,7 +16,7 @@ from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
 from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.scripting.motion_file import TIP_PREFIX, read_motion
-from surgsim_env.tasks.task import Task
+from surgsim_env.tasks.layout import TaskLayout
 
 Action = NDArray[np.floating]
 
@@ -47,7 +47,7 @@ class View:
         contact_position: the tip at the first contact since the step began [m]; None before it  (3,)
         approach: unit vector along which the instrument comes                              (3,)
         grasp: what the jaw holds and how; None without a jaw
-        task: how actions are laid out
+        layout: of the task's actions
         support_force: of the tool on the organ's supports [N]; for the arms of a pair
         arm: the arm of a pair whose view this is; "" for both or the only one
         arms: views of each of several arms, by name
@@ -64,7 +64,7 @@ class View:
     contact_position: FloatArray | None
     approach: FloatArray
     grasp: Grasp | None
-    task: Task
+    layout: TaskLayout
     support_force: float = 0.0
     arm: str = ""
     arms: Mapping[str, "View"] = field(default_factory=dict)
@@ -76,8 +76,8 @@ class View:
         """
         if self.arm == "right":
             own = {"right": velocity, **{f"right_{name}": value for name, value in commands.items()}}
-            return self.task.action(np.zeros(3), **own)
-        return self.task.action(velocity, **commands)
+            return self.layout.action(np.zeros(3), **own)
+        return self.layout.action(velocity, **commands)
 
     def still(self, **commands: Any) -> Action:
         """The action that keeps the tip where it is."""
@@ -86,9 +86,9 @@ class View:
     def carried(self, action: Action, velocity: FloatArray) -> Action:
         """An action with a velocity [m/s] (3,) added to that of each tip, within what an action can ask for."""
         moved = np.array(action, dtype=np.float64)
-        for name in {"velocity", "right"} & set(self.task.action_slices):
-            part = self.task.action_slices[name]
-            moved[part] = np.clip(moved[part] + self.task.action(**{name: velocity})[part], -1.0, 1.0)
+        for name in {"velocity", "right"} & set(self.layout.action_slices):
+            part = self.layout.action_slices[name]
+            moved[part] = np.clip(moved[part] + self.layout.action(**{name: velocity})[part], -1.0, 1.0)
         return moved
 
     def from_surface(self, shift: FloatArray, contact_shift: FloatArray) -> "View":
@@ -393,11 +393,12 @@ class AwaitEnd(_Checked):
 class Control(_Checked):
     """Let a controller of your own act, until `until(view)` is true or the episode ends; fails after `timeout` [s].
 
-    The controller is called with each observation and returns the action; if it has a `reset`, that is called first.
+    The controller is called with each observation and returns the action, or a dictionary of commands in SI units, by
+    name; if it has a `reset`, that is called first.
     Without `until` it acts for `timeout`, which is then no failure.
     """
 
-    controller: Callable[[np.ndarray], Action] = field(repr=False)
+    controller: Callable[[np.ndarray], Action | dict[str, Any]] = field(repr=False)
     timeout: float
     until: Predicate | None = field(default=None, repr=False)
     name: str = ""
@@ -409,7 +410,8 @@ class Control(_Checked):
         if reset is not None:
             reset()
         while not (_over(view, self.timeout) if self.until is None else self.until(view)):
-            view = yield np.asarray(self.controller(copy.deepcopy(view.observation)))
+            acted = self.controller(copy.deepcopy(view.observation))
+            view = yield view.layout.action(**acted) if isinstance(acted, dict) else np.asarray(acted)
 
 
 def _over(view: View, duration: float) -> bool:

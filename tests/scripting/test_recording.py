@@ -95,5 +95,5 @@ def test_a_step_cut_short_by_the_hard_limit_is_recorded_as_far_as_it_went():
             _, _, over, _, info = env.step(np.array([0.0, 0.0, -1.0, 0.0], dtype=np.float32))
     sizes = np.linalg.norm(record.wrench[:, :, :3].sum(axis=1), axis=1)
     assert info["hard_limit"] and len(record) % 50
-    assert (sizes[:-1] <= env.task.force_limit).all() and sizes[-1] > env.task.force_limit
+    assert (sizes[:-1] <= env.runtime.force_limit).all() and sizes[-1] > env.runtime.force_limit
     assert sizes.max() == pytest.approx(info["force_peak"], rel=1e-15)

@@ -1,8 +1,8 @@
 """A scripted expert for SurgSim/Palpate-v0 with memory=True: slide over the face, go back to the stiffest, declare.
 
-It has no state: each action is a function of one observation. The tip slides along rows at a constant depth, less where
-the force nears the soft limit; the observation holds the measured contrast. After the rows it returns to the stiffest
-place and declares it.
+It has no state: each action is a function of one observation, which holds the measured contrast. The tip slides along
+rows at a constant depth, less near the soft limit of force. After the rows it returns to the stiffest place and
+declares it.
 """
 
 from typing import Any

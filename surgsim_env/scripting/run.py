@@ -142,7 +142,7 @@ class _Run:
     def _look(self, began: float, first: int) -> View:
         """The view now; the step of the script began at a time [s], with a number of recorded haptic steps."""
         simulation, touched = self.inner.simulation, self.record.first_contact(first)
-        instrument = simulation.instrument
+        instrument, force = simulation.instrument, self.layout.observation_slices["contact_force"]
         view = View(
             time=simulation.time,
             step_time=simulation.time - began,
@@ -152,7 +152,7 @@ class _Run:
             tip_velocity=instrument.tip_velocity,
             true_force=simulation.contact_force,
             # As no wrapper or picture has changed it.
-            sensed_force=self.layout.sensed_force(self.inner.task_observation),
+            sensed_force=self.inner.task_observation[force].astype(np.float64),
             contact_position=None if touched is None else self.record.tip_position_at(touched),
             approach=simulation.anatomy.face.approach.copy(),
             grasp=simulation.grasp,

@@ -352,7 +352,7 @@ class RetractTask(Task):
         return np.array(self.drawn.start)
 
     def accepts(self, simulation: Simulation) -> bool:
-        """Whether the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
+        """True if the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
         self.look(simulation)
         return self.visible_share <= HIDDEN_SHARE
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
+from surgsim_apps.arms.arm_picture import filling_camera
 from surgsim_apps.arms.ports import Ports
 from surgsim_apps.arms.results import (
     QUANTITIES,
@@ -34,7 +35,7 @@ from surgsim_apps.reports.surface_drawing import (
     save_png,
 )
 from surgsim_env.instruments import Arm
-from surgsim_env.rendering import DrawnCapsule, draw_still, filling
+from surgsim_env.rendering import DrawnCapsule, draw_still
 from surgsim_env.step_progress import StepProgress
 
 if TYPE_CHECKING:
@@ -249,7 +250,7 @@ def draw_arms(evaluation: ArmsEvaluation, arms: Sequence[Arm], ports: Ports) -> 
     if (ends.mean(axis=0) - evaluation.surface_points.mean(axis=0)) @ away > 0.0:
         away = -away
     seen = np.concatenate([ends, evaluation.surface_points])
-    camera = filling(seen, 0.88 * away + 0.48 * up, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
+    camera = filling_camera(seen, 0.88 * away + 0.48 * up, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
     surface = evaluation.surface_points, evaluation.surface_triangles
     return draw_still(surface, posed, capsules, [camera], SIZE)[0]
 

@@ -139,7 +139,7 @@ class Ports:
             ValueError: names the port, its place and the organ.
         """
         for name, port in self.frames.items():
-            check_port_outside(port, anatomy, what=f"the {name} port")
+            check_port_outside(port, anatomy, name=f"the {name} port")
 
 
 def read_ports(path: str | Path) -> Ports:

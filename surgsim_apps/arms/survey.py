@@ -10,15 +10,8 @@ import numpy as np
 
 from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
 from msdm_core.mesh import FloatArray
-from surgsim_env.instruments import (
-    MESH_FORMATS,
-    faulty_links,
-    find_mesh,
-    mesh_names,
-    read_model,
-    read_xml,
-    speed_limits,
-)
+from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
+from surgsim_env.instruments import MESH_FORMATS, find_mesh, mesh_names, read_model, read_xml
 from surgsim_env.scene import LinkInertia, Vector, nearest
 
 # Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.

@@ -38,7 +38,7 @@ class Arms:
     """The right arm, likewise."""
     ports: Path | None = None
     """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; default:
-    ports as in laparoscopy (docs/evaluation.md)."""
+    ports as in laparoscopy (docs/arms_report.md)."""
     scene: str = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     compare: tuple[str, ...] = ()

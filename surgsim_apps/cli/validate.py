@@ -18,7 +18,7 @@ class Validate:
     quick: bool = False
     """Only the cases that take seconds."""
     out: MaybePath = None
-    """Folder for validation.md and images/. Default: docs/ of a checkout; runs/validation elsewhere or with --quick."""
+    """Folder for validation.md, .csv and images/. Default: docs/ of a checkout; else, or --quick, runs/validation."""
 
     def run(self, console: Console) -> int:
         """Run the cases, print and write the report; returns the exit status.
@@ -27,10 +27,10 @@ class Validate:
             OSError: the folder cannot be written (checked before the work).
         """
         from surgsim_apps.validation import suite
-        from surgsim_apps.validation.report import REPORT_NAME, print_report, write_report
+        from surgsim_apps.validation.report import REPORT_NAME, TABLE_NAME, print_report, write_report
 
         folder = report_folder(self.out, "validation", quick=self.quick)
-        with output_folder(folder, [REPORT_NAME]) as files:
+        with output_folder(folder, [REPORT_NAME, TABLE_NAME]) as files:
             validation = suite.run_cases(quick=self.quick, console=console)
             print_report(validation, console)
             write_report(validation, files)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from surgsim_apps.scoring.figures import RESAMPLES, ScoreEstimate, figure_with_interval, presses_to_line
 from surgsim_apps.scoring.results import SITES, Result, seeds_text
-from surgsim_env.palpation import RESAMPLES, ScoreEstimate, figure_with_interval, presses_to_line
 
 # Heading, digits, factor and unit of each figure.
 SHOWN = {

@@ -13,16 +13,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from surgsim_apps.scoring.figures import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation import (
-    HOLD_TIME,
-    PRESS_SPEED,
-    MapScore,
-    PalpationRecord,
-    ScoreEstimate,
-    press_errors,
-    with_intervals,
-)
+from surgsim_env.palpation import HOLD_TIME, PRESS_SPEED
 from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
 from surgsim_env.tasks import SUCCESS_ERROR, PalpateSitesTask
 

@@ -38,6 +38,7 @@ from surgsim_apps.scoring.episodes import (
 )
 from surgsim_apps.scoring.expert_palpate import PalpateExpert
 from surgsim_apps.scoring.expert_retract import RetractExpert
+from surgsim_apps.scoring.figures import PalpationRecord, press_errors, score, with_intervals
 from surgsim_apps.scoring.options import ScoringOptions
 from surgsim_apps.scoring.results import (
     SITES,
@@ -48,7 +49,6 @@ from surgsim_apps.scoring.results import (
 )
 from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation import PalpationRecord, press_errors, score, with_intervals
 from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
 from surgsim_env.step_progress import StepProgress
 

@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from surgsim_apps.scoring.figures import EVALUATION_SEEDS
 from surgsim_apps.scoring.results import read_seeds
-from surgsim_env.palpation import EVALUATION_SEEDS
 
 
 @dataclass(frozen=True)

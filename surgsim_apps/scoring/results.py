@@ -8,7 +8,7 @@ from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from surgsim_env.palpation import ScoreEstimate
+from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_env.scene import STILL, agents_folder
 
 # JSON has no infinity.

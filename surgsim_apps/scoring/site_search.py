@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from surgsim_apps.scoring.figures import MapScore
 from surgsim_apps.training.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
-from surgsim_env.palpation import MapScore
 from surgsim_env.tasks import PalpateSitesTask
 
 # Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike
 from msdm_core.arithmetic import matmul
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
-from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, KEPT_NAMES, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.compile import blank_state, relax_arms, rest_state
+from msdm_core.organ.compile import relax_arms, rest_state
 from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
 from msdm_core.organ.motion import SIGNAL, place_on_ground
 from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import describe_fault
 from surgsim_env.coupling.exchange import StepsTaken, haptic_loop, step_outcome, step_plan, steps_taken
 from surgsim_env.coupling.motion import draw_drive, go_on, hold, signals
@@ -29,7 +30,6 @@ from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import substeps_needed
 
 # The fields of an organ's state that are saved.
-KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
 # What is drawn of an organ's motions, and saved.
 DRAWN_FIELDS = ("cycle_start", "cycle_size", "delay")
 # The tip may move this far beyond the organ's bounding box [m].
@@ -445,8 +445,8 @@ class Simulation:
 
     @property
     def _kept_fields(self) -> tuple[str, ...]:
-        """KEPT_FIELDS, without those of motions where nothing moves the organ."""
-        return KEPT_FIELDS if self.anatomy.scene.motions else tuple(name for name in KEPT_FIELDS if name != "motion")
+        """KEPT_NAMES, without those of motions where nothing moves the organ."""
+        return KEPT_NAMES if self.anatomy.scene.motions else tuple(name for name in KEPT_NAMES if name != "motion")
 
     def _check_step(self, organ_model: OrganModel) -> None:
         limit = stable_dt(organ_model, self.contact)

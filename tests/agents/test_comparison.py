@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from surgsim_apps.scoring.comparison import compare, describe
+from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.results import SITES, Result
-from surgsim_env.palpation.scores import ScoreEstimate
 
 pytestmark = pytest.mark.agents
 SEEDS = tuple(range(1_000_000, 1_000_040))

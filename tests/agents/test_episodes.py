@@ -19,8 +19,8 @@ from surgsim_apps.scoring.episodes import (
     play_tasks,
     site_success,
 )
+from surgsim_apps.scoring.figures import MapScore, press_errors
 from surgsim_apps.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
-from surgsim_env.palpation.scores import MapScore, press_errors
 from surgsim_env.rendering import gl
 from surgsim_env.tasks.palpate import EPISODE_STEPS
 

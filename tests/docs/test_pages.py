@@ -30,9 +30,11 @@ def hook(name: str):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT / "docs").as_posix())
 def test_files_and_modules_that_are_named_exist(page):
     text = page.read_text(encoding="utf-8")
-    for place in re.findall(r"`((?:scenes|msdm_core|surgsim_env|agents|docs|tests|benchmarks)/[\w/.]*)`", text):
+    folders = "scenes|msdm_core|surgsim_env|surgsim_apps|agents|docs|tests|benchmarks"
+    for place in re.findall(rf"`((?:{folders})/[\w/.]*)`", text):
         assert (ROOT / place).exists(), place
-    for name in re.findall(r"`((?:msdm_core|surgsim_env)(?:\.\w+)+)(?:\([^`]*)?`|^::: (\S+)", text, flags=re.MULTILINE):
+    packages = "msdm_core|surgsim_env|surgsim_apps"
+    for name in re.findall(rf"`((?:{packages})(?:\.\w+)+)(?:\([^`]*)?`|^::: (\S+)", text, flags=re.MULTILINE):
         assert resolved(name[0] or name[1]) is not None, name
 
 

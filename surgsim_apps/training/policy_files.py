@@ -71,14 +71,16 @@ def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
     if not isinstance(task, Task):
         return None
     space = inner.observation_space
-    read, pictures = set(inner.layout.declared), {}
+    observed = inner.layout.observed
+    read, pictures = {channel.name for channel, _ in observed}, {}
     if space.shape is None or len(space.shape) > 1:
         parts = space.spaces if isinstance(space, gym.spaces.Dict) else {"picture": space}
         read = {one.name for one in task.channels if one.felt and "force" in parts}
         pictures = {"picture": [list(parts["picture"].shape or ()), "uint8"]}
-    channels = {name: one for name, one in inner.layout.declared.items() if name in read}
     return pictures | {
-        name: [size, scale if getattr(inner, "scaled", True) else "SI"] for name, (size, scale) in channels.items()
+        channel.name: [size, channel.scale_shown if getattr(inner, "scaled", True) else "SI"]
+        for channel, size in observed
+        if channel.name in read
     }
 
 

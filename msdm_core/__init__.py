@@ -5,7 +5,7 @@ from pathlib import Path
 from msdm_core import numba_cache
 
 with numba_cache.kernel_cache(Path(__file__).parent):
-    # First of all: what is compiled is cached where it was decorated.
+    # First of all: a function is cached in the folder at its decoration.
     from msdm_core.kernels import linear_kernels, load_kernels, matrix_kernels, ray_kernels, substep_kernels  # noqa: F401
 from msdm_core.errors import MeshError, OrganDivergedError, OrganError
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState

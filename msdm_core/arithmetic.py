@@ -1,10 +1,10 @@
-"""Functions, products and decompositions whose rounding is the same on every processor.
+"""Elementary functions, products and decompositions with the same rounding on every processor.
 
 IEEE 754 fixes the rounding of + - * / and of the square root. numpy's other functions choose their implementation by
 processor (AVX-512 has its own `cbrt`, `exp`, `log`), BLAS and LAPACK choose the order of their sums by processor, and
-the C library's functions differ by version. What decides an episode is therefore computed by these: elementary
-functions as series and Newton iterations of numpy's element-wise arithmetic, sums in an order that the source fixes.
-All are accurate to a few units in the last place.
+the C library's functions differ by version. Episodes therefore depend on these functions alone: series and Newton
+iterations of numpy's element-wise arithmetic, and sums in an order fixed by the source. All are accurate to a few units
+in the last place.
 """
 
 import math
@@ -35,7 +35,7 @@ __all__ = [
     "svd",
 ]
 
-# ln 2 and pi / 2 in parts; a small whole number times any but the last part is exact.
+# ln 2 and pi / 2 in parts; a small integer times any but the last part is exact.
 LN2 = (0.693147180369123816490, 1.90821492927058770002e-10)
 HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 # Angles up to this can be reduced with HALF_PI [rad].
@@ -58,8 +58,8 @@ def exp(x: ArrayLike) -> FloatArray:
     # Beyond these limits the result is infinite or 0.
     x = np.clip(x, -800.0, 800.0)
     count = np.rint(x * (1.0 / LN2[0]))
-    rest = (x - count * LN2[0]) - count * LN2[1]
-    return np.ldexp(_series(_EXP, rest), _whole(count))
+    remainder = (x - count * LN2[0]) - count * LN2[1]
+    return np.ldexp(_series(_EXP, remainder), _integer(count))
 
 
 def log(x: ArrayLike) -> FloatArray:
@@ -80,18 +80,18 @@ def log(x: ArrayLike) -> FloatArray:
 def log1p(x: ArrayLike) -> FloatArray:
     """ln(1 + x) of each number, accurate near 0 (Kahan's correction of the rounding of 1 + x)."""
     x = np.asarray(x, dtype=np.float64)
-    more = 1.0 + x
-    change = more - 1.0
-    return np.where(change == 0.0, x, log(more) * (x / np.where(change == 0.0, 1.0, change)))[()]
+    total = 1.0 + x
+    change = total - 1.0
+    return np.where(change == 0.0, x, log(total) * (x / np.where(change == 0.0, 1.0, change)))[()]
 
 
 def expm1(x: ArrayLike) -> FloatArray:
     """e^x - 1 of each number, accurate near 0 (Kahan's correction of the rounding of e^x)."""
     x = np.asarray(x, dtype=np.float64)
     power = exp(x)
-    usual = (power != 1.0) & (power > 0.0) & (power < math.inf)
-    logarithm = log(np.where(usual, power, 2.0))
-    return np.where(usual, (power - 1.0) * (x / logarithm), np.where(power == 1.0, x, power - 1.0))[()]
+    regular = (power != 1.0) & (power > 0.0) & (power < math.inf)
+    logarithm = log(np.where(regular, power, 2.0))
+    return np.where(regular, (power - 1.0) * (x / logarithm), np.where(power == 1.0, x, power - 1.0))[()]
 
 
 def power(x: ArrayLike, exponent: ArrayLike) -> FloatArray:
@@ -132,17 +132,17 @@ def cos(angle: ArrayLike) -> FloatArray:
 
 
 def _circular(angle: ArrayLike, quarter: int) -> FloatArray:
-    """sin(angle + quarter pi / 2) by Taylor's series of the rest of whole quarters."""
+    """sin(angle + quarter pi / 2), by Taylor's series of the remainder of whole quarters."""
     angle = np.asarray(angle, dtype=np.float64)
     if np.any(np.abs(angle) > ANGLE_MOST):
         raise ValueError(
             f"angle is {np.abs(angle).max():g} rad; it must be at most {ANGLE_MOST:g} rad: subtract multiples of 2 pi"
         )
     count = np.rint(angle * (2.0 / math.pi))
-    rest = ((angle - count * HALF_PI[0]) - count * HALF_PI[1]) - count * HALF_PI[2]
-    square = rest * rest
-    turn = (_whole(count) + quarter) % 4
-    value = np.where(turn % 2 == 0, rest * _series(_SIN, square), _series(_COS, square))
+    remainder = ((angle - count * HALF_PI[0]) - count * HALF_PI[1]) - count * HALF_PI[2]
+    square = remainder * remainder
+    turn = (_integer(count) + quarter) % 4
+    value = np.where(turn % 2 == 0, remainder * _series(_SIN, square), _series(_COS, square))
     return np.where(turn < 2, value, -value)[()]
 
 
@@ -152,10 +152,10 @@ def arctan2(y: ArrayLike, x: ArrayLike) -> FloatArray:
     small, large = np.minimum(np.abs(y), np.abs(x)), np.maximum(np.abs(y), np.abs(x))
     ratio = small / np.where(large == 0.0, 1.0, large)
     # arctan r = arctan c + arctan((r - c) / (1 + r c)) with c the nearest of 0, 1/2 and 1.
-    step = _whole(np.rint(2.0 * ratio))
+    step = _integer(np.rint(2.0 * ratio))
     near = 0.5 * step
-    rest = (ratio - near) / (1.0 + ratio * near)
-    angle = ARCTANS[step] + rest * _series(_ARCTAN, rest * rest)
+    offset = (ratio - near) / (1.0 + ratio * near)
+    angle = ARCTANS[step] + offset * _series(_ARCTAN, offset * offset)
     angle = np.where(np.abs(y) > np.abs(x), 0.5 * math.pi - angle, angle)
     return np.copysign(np.where(x < 0.0, math.pi - angle, angle), y)
 
@@ -174,8 +174,8 @@ def _series(coefficients: list[float], x: FloatArray) -> FloatArray:
     return value
 
 
-def _whole(count: FloatArray) -> NDArray[np.int64]:
-    """Whole numbers as integers; nan, whose result is nan, as 0."""
+def _integer(count: FloatArray) -> NDArray[np.int64]:
+    """Whole numbers as integers, nan as 0 (their results are nan anyway)."""
     return np.where(np.isfinite(count), count, 0.0).astype(np.int64)
 
 
@@ -194,7 +194,7 @@ def norm(vectors: ArrayLike, axis: int | tuple[int, ...] | None = None, keepdims
 
 
 def matmul(a: ArrayLike, b: ArrayLike) -> FloatArray:
-    """The matrix product a @ b, summed in the order of the common axis; a (..., n, k) or (k,), b (..., k, m) or (k,).
+    """Matrix product a @ b, summed in the order of the common axis; a (..., n, k) or (k,), b (..., k, m) or (k,).
 
     Raises:
         ValueError: common axes of two lengths.
@@ -225,11 +225,11 @@ def matmul(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def solve(matrices: ArrayLike, right: ArrayLike) -> FloatArray:
-    """The x of A x = b, by Gauss elimination with partial pivoting.
+    """Solution x of A x = b, by Gauss elimination with partial pivoting.
 
     Args:
         matrices: A (..., n, n).
-        right: b (..., n, m), or (n,) with one matrix.
+        right: b (..., n, m), or (n,) with a single matrix.
 
     Raises:
         ValueError: a singular matrix.
@@ -260,8 +260,8 @@ def eigh(matrices: ArrayLike) -> tuple[FloatArray, FloatArray]:
 def svd(matrix: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Singular value decomposition A = U diag(s) V of a matrix (m, n).
 
-    U is (m, k), s (k,) descending, V (k, n), with k = min(m, n). Vectors of singular values
-    that are 0 are 0 on the longer side.
+    U is (m, k), s (k,) descending, V (k, n), with k = min(m, n). Vectors of vanishing singular values are 0 on the
+    longer side.
     """
     a = np.array(matrix, dtype=np.float64, order="C")
     if a.shape[0] > a.shape[1]:
@@ -276,7 +276,7 @@ def svd(matrix: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def lstsq(matrix: ArrayLike, right: ArrayLike) -> FloatArray:
-    """The x (n,) of least |A x - b|, and of least |x| where A (m, n) has not full rank; b (m,)."""
+    """Least-squares solution x (n,) of A x = b, A (m, n), b (m,); of least |x| if A has not full rank."""
     left, size, across = svd(matrix)
     least = np.finfo(np.float64).eps * max(np.shape(matrix)) * size.max(initial=0.0)
     kept = size > least

@@ -1,15 +1,29 @@
-"""The errors of the organ model: each says what is wrong, which element, the value, the rule and the way out."""
+"""Errors of the organ model; each message has the element, its value, the rule and the way out."""
 
-__all__ = ["MeshError", "OrganDivergedError", "OrganError"]
+import math
+
+__all__ = ["MeshError", "OrganDivergedError", "OrganError", "require_not_negative", "require_positive"]
 
 
 class MeshError(ValueError):
-    """A surface or tetrahedral mesh that cannot become an organ."""
+    """A surface or tetrahedral mesh unfit for an organ."""
 
 
 class OrganError(ValueError):
-    """An organ specification (materials, lesions, anchors, step) that breaks a physical rule."""
+    """An organ specification (materials, lesions, anchors, step) against a physical rule."""
 
 
 class OrganDivergedError(RuntimeError):
-    """An organ whose state stopped being physical: an inverted tet or a number that is not finite."""
+    """An unphysical state of an organ: an inverted tet or a number that is not finite."""
+
+
+def require_positive(quantity: str, value: float, unit: str) -> None:
+    """Raise OrganError unless a quantity is finite and above 0."""
+    if not 0.0 < value < math.inf:
+        raise OrganError(f"{quantity} is {value} {unit}; it must be finite and above 0")
+
+
+def require_not_negative(quantity: str, value: float, unit: str = "") -> None:
+    """Raise OrganError unless a quantity is finite and at least 0."""
+    if not 0.0 <= value < math.inf:
+        raise OrganError(f"{quantity} is {value} {unit}".rstrip() + "; it must be finite and at least 0")

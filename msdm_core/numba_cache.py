@@ -1,8 +1,8 @@
-"""The folder that numba keeps compiled kernels in, and the message that they are being compiled.
+"""Cache folder of compiled kernels, and the message during their compilation.
 
-numba sees edits of a function's own file only, so the folder is named after the text of all files of kernels. It lies
-in `NUMBA_CACHE_DIR` if that is set, else in the user's cache folder. Nobody else may enter it: a cache is pickled code,
-which runs when it is read.
+numba notices edits of a function's own file only, so the folder's name is a digest of all files of kernels. It lies in
+`NUMBA_CACHE_DIR` if set, else in the user's cache folder, closed to other users: a cache is pickled code, which runs
+when it is read.
 """
 
 import atexit
@@ -30,19 +30,17 @@ LOGGER = logging.getLogger("msdm_core")
 KERNEL_FILES = "*kernels.py"
 FOLDER_PREFIX = "surgsim-kernels-"
 UNUSED_AGE = 7 * 24 * 3600.0  # [s]
-# Anything that takes longer says so [s].
-PATIENCE = 2.0
-# Held while numba's settings, which are those of the whole process, are changed; reentrant, as a package may import
-# another inside.
+PATIENCE = 2.0  # time of compiling without a message [s]
+# For changes of numba's settings, which hold for the whole process; reentrant, as a package may import another inside.
 SETTINGS_LOCK = threading.RLock()
 
 
 @contextmanager
 def kernel_cache(*source_folders: Path) -> Iterator[None]:
-    """Cache functions decorated inside in a folder of their own, a new one whenever a file of kernels has changed.
+    """Cache the functions decorated inside in a folder of their own, new after any change of a file of kernels.
 
     Args:
-        source_folders: folders whose KERNEL_FILES are compiled together.
+        source_folders: folders of KERNEL_FILES compiled together.
     """
     files = sorted(file for folder in source_folders for file in folder.rglob(KERNEL_FILES))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
@@ -59,20 +57,20 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
 
 
 def _cache_folder(chosen: str, name: str) -> Path:
-    """The folder of this name in the chosen place, else in the user's cache folder; a temporary one if it fails."""
+    """Folder of this name in the chosen place, else in the user's cache folder; a temporary folder if that fails."""
     try:
         # An account without a home has "~/.cache", or none.
         folder = Path(chosen or platformdirs.user_cache_dir("surgsim")).expanduser() / name
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o700)
-        # Nobody takes it for unused.
+        # Now in use, see `_remove_unused`.
         os.utime(folder)
-        # `os.access` would lie to root and on read-only file systems.
+        # `os.access` is wrong for root and on read-only file systems.
         tempfile.TemporaryFile(dir=folder).close()
     except (OSError, RuntimeError) as error:
         warnings.warn(
-            f"no folder can be written for compiled kernels ({error}): they are lost at the end of this process, and "
-            "each start compiles for a minute; set NUMBA_CACHE_DIR to a folder that can be written",
+            f"no writable folder for compiled kernels ({error}): they are lost at the end of this process, and each "
+            "start compiles for a minute; set NUMBA_CACHE_DIR to a writable folder",
             RuntimeWarning,
             stacklevel=2,
         )
@@ -84,7 +82,7 @@ def _cache_folder(chosen: str, name: str) -> Path:
 
 
 def _remove_unused(place: Path) -> None:
-    """Remove the folders of earlier texts that no process has begun to use for UNUSED_AGE."""
+    """Remove folders of other digests without a new process for UNUSED_AGE."""
     for folder in place.glob(f"{FOLDER_PREFIX}*"):
         # Another process may remove it at the same time.
         with suppress(OSError):
@@ -93,14 +91,14 @@ def _remove_unused(place: Path) -> None:
 
 
 class KernelCache(FunctionCache):
-    """numba's cache of one function; damage, or a lack of room, is warned of, and the function compiled."""
+    """numba's cache of one function, with a warning and recompilation after damage or without disk space."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled function for argument types; None where it is to be compiled."""
+        """Compiled function for argument types; None if it has to be compiled."""
         try:
             loaded = super().load_overload(sig, target_context)
-            # Two processes that compile a function for different types at once may leave an index that names one file
-            # for both: the code of the other types would run.
+            # Two processes compiling a function for different types at once may leave an index with one file for both:
+            # the code for the other types would run.
             if loaded is not None and tuple(loaded.signature.args) != tuple(sig):
                 raise ValueError(f"a function for {loaded.signature.args} is filed under {sig}")
         except Exception as error:  # unpickling damaged bytes may raise anything
@@ -117,7 +115,7 @@ class KernelCache(FunctionCache):
         return loaded
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled function."""
+        """Save a compiled function."""
         try:
             super().save_overload(sig, data)
         except OSError as error:
@@ -126,19 +124,19 @@ class KernelCache(FunctionCache):
 
 @functools.cache
 def _warn_of_no_room(folder: Path, reason: str) -> None:
-    """Warn once, not for each of the functions."""
+    """Warn once for all functions."""
     warnings.warn(
-        f"compiled kernels cannot be kept in {folder} ({reason}): each start compiles for a minute; make room, or set "
-        "NUMBA_CACHE_DIR to a folder that has some",
+        f"compiled kernels cannot be saved in {folder} ({reason}): each start compiles for a minute; free disk space, "
+        "or set NUMBA_CACHE_DIR to another folder",
         RuntimeWarning,
         stacklevel=2,
     )
 
 
 class CompileMessage(event.Listener):
-    """Logs once that kernels are being compiled, when that has taken longer than PATIENCE, and when it is over.
+    """Log messages during a compilation of kernels longer than PATIENCE and at its end.
 
-    numba calls it before and after each function, which may be one that another calls, under its compiler's lock.
+    numba calls it under its compiler's lock, before and after each function; compilations of callees are nested.
     """
 
     def __init__(self) -> None:
@@ -166,7 +164,7 @@ class CompileMessage(event.Listener):
 
 
 def _is_kernel(event: Any) -> bool:
-    """Whether a function is one of ours, not one of the program that imports us."""
+    """True for a function of this project, False for others in the process."""
     return event.data["dispatcher"].py_func.__module__.startswith(("msdm_core.", "surgsim_env."))
 
 

@@ -64,10 +64,6 @@ SCIPY_FIXED = {"scipy", "scipy.sparse", "scipy.sparse.csgraph", "scipy.spatial",
 # Deliberate exceptions: what they may use, and why.
 UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
     "msdm_core/arithmetic.py": (("**",), "powers of -1"),
-    "msdm_core/material/continuum.py": (
-        ("**", "np.einsum", "np.sin", "np.cos"),
-        "the continuum's stress, for validation",
-    ),
     "msdm_core/material/fitting.py": (("@",), "sparse matrices, whose products are plain loops"),
     "msdm_core/material/tissue_law.py": (("sum",), "arrays"),
     "msdm_core/meshing/segmentation_meshing.py": (("sum",), "whole numbers"),

@@ -1,7 +1,7 @@
-"""Functions of the kernels as device functions of one floating-point type, made from the same source.
+"""Device functions of one floating-point type from the source of the kernels.
 
-A number in the text of a kernel is float64, and makes an expression of float32 numbers float64 too. Here each function
-is built anew from its code, with such numbers, and the constants of its module, in the type that is asked for.
+A literal in a kernel is float64, and makes an expression of float32 numbers float64 too. Each function is therefore
+built again from its code, with its literals and the constants of its module in the requested type.
 """
 
 import math
@@ -13,7 +13,7 @@ from numba import config, cuda, from_dtype, types
 
 from msdm_core.kernels import vector_kernels
 
-# In the text of a kernel: the type that it is made for, as numpy and as numba name it.
+# Placeholders for the floating-point type in a kernel, for numpy and for numba.
 REAL, REAL_TYPE = np.float64, types.float64
 
 
@@ -29,10 +29,10 @@ def _any_below(value, limit):
     return value < limit
 
 
-# Whether numba simulates devices, NUMBA_ENABLE_CUDASIM.
+# numba's simulator of devices, NUMBA_ENABLE_CUDASIM.
 SIMULATED = bool(config.ENABLE_CUDASIM)  # pyright: ignore[reportAttributeAccessIssue]
 
-# Functions of vector registers for one number.
+# Scalar equivalents of functions of vector registers.
 SCALAR: dict[Any, Any] = {
     vector_kernels.root: math.sqrt,
     vector_kernels.keep_lower: _keep_lower,
@@ -41,41 +41,41 @@ SCALAR: dict[Any, Any] = {
 }
 
 
-def _known(**options: Any) -> dict[str, Any]:
-    """Options of `cuda.jit`; the simulator knows none of these."""
+def _options(**options: Any) -> dict[str, Any]:
+    """Options of `cuda.jit`; the simulator has none of these."""
     return {} if SIMULATED else options
 
 
 class DeviceFunctions:
-    """Device functions of one floating-point type; each is made once."""
+    """Device functions of one floating-point type, each compiled once."""
 
     def __init__(self, dtype: Any, **names: Any) -> None:
-        """Make functions of np.float32 or np.float64, in which some names of modules have other values."""
+        """Functions of np.float32 or np.float64, with other values for some names of their modules."""
         self._dtype = np.dtype(dtype).type
         self._names = names
-        self._made: dict[Any, Any] = {}
+        self._functions: dict[Any, Any] = {}
 
     def __call__(self, function: Any) -> Any:
-        """The device function of a kernel's function: a plain one, or one that is compiled for the processor."""
-        if function not in self._made:
-            self._made[function] = cuda.jit(device=True, **_known(forceinline=True))(self.typed(function))
-        return self._made[function]
+        """Device function of a plain function, or of a function compiled for the processor."""
+        if function not in self._functions:
+            self._functions[function] = cuda.jit(device=True, **_options(forceinline=True))(self.typed(function))
+        return self._functions[function]
 
     def kernel(self, function: Any, registers: int | None = None) -> Any:
-        """The kernel of a plain function, whose threads have at most so many registers."""
-        return cuda.jit(**_known(max_registers=registers))(self.typed(function))
+        """Kernel of a plain function, with a limit to the registers of a thread."""
+        return cuda.jit(**_options(max_registers=registers))(self.typed(function))
 
     def typed(self, function: Any) -> FunctionType:
-        """A plain function whose constants are of the type, and whose callees are device functions."""
+        """Plain function with constants of the type and device functions as callees."""
         source = getattr(function, "py_func", function)
         code = source.__code__
-        known = {**source.__globals__, **self._names}
-        names = {name: self._value(known[name]) for name in code.co_names if name in source.__globals__}
+        scope = {**source.__globals__, **self._names}
+        names = {name: self._value(scope[name]) for name in code.co_names if name in source.__globals__}
         constants = tuple(self._constant(value) for value in code.co_consts)
         return FunctionType(code.replace(co_consts=constants), {**source.__globals__, **names}, source.__name__)
 
     def _value(self, value: Any) -> Any:
-        """The stand-in for what a name of a module means."""
+        """Device's value for the value of a name in a module."""
         if value is REAL:
             return self._dtype
         if value is REAL_TYPE:
@@ -85,8 +85,8 @@ class DeviceFunctions:
         if isinstance(value, np.ndarray) and value.dtype == np.float64:
             return value.astype(self._dtype)
         if callable(value) and value in SCALAR:
-            stand_in = SCALAR[value]
-            return self(stand_in) if isinstance(stand_in, FunctionType) else stand_in
+            scalar = SCALAR[value]
+            return self(scalar) if isinstance(scalar, FunctionType) else scalar
         return self._constant(value)
 
     def _constant(self, value: Any) -> Any:

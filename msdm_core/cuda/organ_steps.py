@@ -1,8 +1,8 @@
-"""Haptic steps of many organs on a CUDA device: a block of threads advances an organ; or all blocks advance one.
+"""Haptic steps of organs on a CUDA device: a block of threads for each organ, or all blocks for a single organ.
 
-`device_functions` makes this text for a floating-point type. Forces are gathered node by node, in the order of a list:
-no two threads add to one number, so that runs repeat to the bit on one device. Threads wait for each other between the
-passes (`_wait`); one thread does what has an order: tools, the guard, squeezed tets.
+`device_functions` compiles this text for a floating-point type. Forces are gathered node by node, in the order of a
+list: no two threads add to one number, so that runs repeat to the bit on one device. Barriers (`_wait`) separate the
+passes; a single thread does the sequential parts: tools, the guard, squeezed tets.
 """
 
 import math
@@ -47,6 +47,7 @@ from msdm_core.kernels.element_kernels import (
     volume_ratio,
 )  # fmt: skip
 from msdm_core.kernels.guard_kernels import FAR, guard_axes, near_axis, watched_distance
+from msdm_core.kernels.lane_view_kernels import SurfaceView, TouchedView
 from msdm_core.kernels.squeeze_kernels import hold_squeezed
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -54,27 +55,25 @@ from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
     FAULT_NOT_FINITE,
     ContactShapes,
-    SurfaceView,
     ToolResponse,
-    TouchedView,
 )  # fmt: skip
 from msdm_core.kernels.substep_kernels import move_shapes, push_tools
 
-# What threads tell each other within a substep: entries of `Scratch.flags`.
+# Signals between threads within a substep: entries of `Scratch.flags`.
 INVERTED, SQUEEZED, GUARDED, NOT_FINITE, PASSED, ENTRY_COUNT, NODE_COUNT, SQUEEZED_COUNT = range(8)
 FLAG_COUNT = 8
-# Whether `Working` is in shared memory.
+# `Working` is in shared memory.
 SHARED = True
 
 
 class DeviceModel(NamedTuple):
-    """The constants of organs on a device, SI units; what each lane has of its own has the lane as first index.
+    """Constants of organs on a device, SI units; own fields of lanes have the lane as first index.
 
     Fields:
         tet_nodes, tet_inverse_volume, spring_nodes, spring_rest_length, node_inverse_volume, surface_triangles,
             surface_rest_area, foundation_position, foundation_stiffness, gravity: as in `OrganModel`
-        node_tet_count: how many tets a node has                                 (n_node,)
-        node_tets: each with its other corners, so that they turn outwards       (most, n_node, 4)
+        node_tet_count: number of tets at each node                              (n_node,)
+        node_tets: each with its other corners in outward order                  (most, n_node, 4)
         node_spring_count, node_springs: each with its other end                 (n_node,), (most, n_node, 2)
         node_foundation: row of foundation_position; -1 for none                 (n_node,)
         surface_nodes: nodes of the surface                                      (n_surface_node,)
@@ -111,7 +110,7 @@ class DeviceModel(NamedTuple):
 
 
 class DeviceState(NamedTuple):
-    """What changes while organs on a device move; as in `OrganState`, with the lane as first index."""
+    """State of organs on a device, as in `OrganState` with the lane as first index."""
 
     node_position: Any
     node_velocity: Any
@@ -123,10 +122,10 @@ class DeviceState(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What a block needs while it advances an organ; the block is the first index.
+    """Working memory of a block; the block is the first index.
 
     Fields:
-        flags: see INVERTED and on                                               (n_block, FLAG_COUNT)
+        flags: signals, at INVERTED and so on                                    (n_block, FLAG_COUNT)
         counts: of each thread                                                   (n_block, n_thread)
         candidates: triangles in reach of each shape, as in `OrganState`         (n_block, n_shape, n_surface)
         entry: place of a triangle in `listed`, or -1                            (n_block, n_shape, n_surface)
@@ -134,8 +133,8 @@ class Scratch(NamedTuple):
         rows, places: as in `OrganState`                                         (n_block, n_slot, ...)
         touched: places in surface_nodes of nodes in reach                       (n_block, n_surface_node)
         hold: as contact_hold in `OrganState`                                    (n_block, n_node)
-        squeezed: tets that are squeezed                                         (n_block, n_tet)
-        pool: numbers of the organ, where shared memory has no room for them     (n_block, n_number)
+        squeezed: squeezed tets                                                  (n_block, n_tet)
+        pool: `Working`, if too large for shared memory                          (n_block, n_number)
     """
 
     flags: Any
@@ -187,7 +186,7 @@ class StepNumbers(NamedTuple):
 
 
 class Working(NamedTuple):
-    """Numbers of the organ that a block advances: positions, velocities and forces (n_node, 3), then one per item."""
+    """Numbers of a block's organ: positions, velocities and forces (n_node, 3), then one per item."""
 
     position: Any
     velocity: Any
@@ -198,12 +197,12 @@ class Working(NamedTuple):
 
 
 def working_size(nodes: int, tets: int, springs: int) -> int:
-    """How many numbers `Working` has."""
+    """Number of elements in `Working`."""
     return 10 * nodes + tets + springs
 
 
 def _wait(grid):
-    """Wait for all threads that advance the organ: of the block, or of the grid."""
+    """Barrier for all threads of the organ: those of the block, or of the grid."""
     if grid is None:
         cuda.syncthreads()
     else:
@@ -232,7 +231,7 @@ def _set_tensions(first, stride, model, lane, work):
 
 
 def _set_scales(first, stride, model, lane, work, flags, lowest):
-    """From volumes to factors on gradients, and of each spring the factor on its edge; returns the smallest ratio."""
+    """Factors on gradients from volumes, and factors on the edges of springs; returns the smallest volume ratio."""
     tension = work.tension
     for tet in range(first, model.tet_nodes.shape[0], stride):
         ratio = volume_ratio(work.tet[tet], model.tet_inverse_volume[tet])
@@ -261,7 +260,7 @@ def _set_forces(first, stride, model, lane, work):
         fx, fy, fz = REAL(0.0), REAL(0.0), REAL(0.0)
         for slot in range(model.node_tet_count[node]):
             p = model.node_tets[slot, node, 1]
-            # At any corner the gradient is the product of two edges of the face opposite.
+            # The gradient at a corner is the product of two edges of the opposite face.
             g = corner_gradient(
                 edge(position, p, model.node_tets[slot, node, 2]), edge(position, p, model.node_tets[slot, node, 3])
             )
@@ -310,7 +309,7 @@ def _integrate(first, stride, model, lane, work, numbers, flags):
 
 
 def _places(counts, own):
-    """The place of a thread's first item in a list of all threads' items in order, and the length of the list."""
+    """Place of a thread's first item in the ordered list of all threads' items, and the length of the list."""
     thread, threads = cuda.threadIdx.x, cuda.blockDim.x
     counts[thread] = own
     cuda.syncthreads()
@@ -327,14 +326,14 @@ def _places(counts, own):
 
 
 def _share(count):
-    """The items of a list that a thread looks at, one after the other: the first, and the one after the last."""
+    """A thread's items of a list: the first, and the end."""
     width = (count + cuda.blockDim.x - 1) // cuda.blockDim.x
     begin = min(cuda.threadIdx.x * width, count)
     return begin, min(begin + width, count)
 
 
 def _add_up(sums):
-    """Add up each row of `sums` over the threads of a block, in a fixed order, into its first column."""
+    """Sum of each row of `sums` over the threads of a block, in a fixed order, into its first column."""
     thread, threads = cuda.threadIdx.x, cuda.blockDim.x
     cuda.syncthreads()
     step = 1
@@ -394,7 +393,7 @@ def _find_candidates(model, engaged, shapes, position, duration, block, scratch)
 
 
 def _is_touched(model, entry, item):
-    """Whether a node of the surface belongs to a candidate."""
+    """True if a node of the surface belongs to a candidate."""
     for place in range(model.facet_count[item]):
         for shape in range(entry.shape[0]):
             if entry[shape, model.facets[item, place] // 3] >= 0:
@@ -421,10 +420,7 @@ def _press(model, work, engaged, stretch, shapes, law, dt, block, scratch):
 
 
 def _push_nodes(model, work, law, dt, sweep, block, scratch):
-    """Add to each node what its points push it with: at first (sweep -1), or what a sweep has added.
-
-    At first also what contact holds the node with.
-    """
+    """Add the forces of its points to each node: at first (sweep -1) in full, with the hold, then a sweep's change."""
     entry, rows, places = scratch.entry[block], scratch.rows[block], scratch.places[block]
     hold, touched = scratch.hold[block], scratch.touched[block]
     along, across = hold_rates(law, dt)
@@ -460,13 +456,13 @@ def _push_nodes(model, work, law, dt, sweep, block, scratch):
 
 
 def _guard(model, lane, work, state, shapes, response, law, dt, reference, wrench, block, scratch):
-    """The guard of the axes: each candidate is looked at, and where one is near, all are in order."""
+    """Guard of the axes: all candidates in order, if any is near."""
     listed, flags, surface = scratch.listed[block], scratch.flags[block], model.surface_triangles
     for number in range(cuda.threadIdx.x, flags[ENTRY_COUNT], cuda.blockDim.x):
         shape, triangle = listed[number, 0], listed[number, 1]
         watched = watched_distance(shapes, dt, shape)
-        where, _ = near_axis(work.position, work.velocity, surface, shapes, law, dt, shape, triangle, watched)
-        if where != FAR:
+        nearness, _ = near_axis(work.position, work.velocity, surface, shapes, law, dt, shape, triangle, watched)
+        if nearness != FAR:
             flags[GUARDED] = 1
     cuda.syncthreads()
     if flags[GUARDED] != 0:
@@ -537,7 +533,7 @@ def _add_wrench(work, shapes, law, reference, wrench, block, scratch, sums):
 
 
 def _hold_squeezed(model, lane, work, dt, block, scratch):
-    """Squeezed tets, listed in order and held one after the other, see `squeeze_kernels.hold_squeezed`."""
+    """Squeezed tets in order, see `squeeze_kernels.hold_squeezed`."""
     squeezed, flags = scratch.squeezed[block], scratch.flags[block]
     begin, end = _share(model.tet_nodes.shape[0])
     own = 0
@@ -587,7 +583,7 @@ def _haptic_step(
     grid, leads, first, stride, model, lane, work, state, shapes, response, law, numbers, reference, wrench, block,
     scratch, sums, lowest,
 ):  # fmt: skip
-    """The substeps of one haptic step; returns the smallest volume ratio that a thread has seen."""
+    """Substeps of one haptic step; returns the thread's smallest volume ratio."""
     flags, dt = scratch.flags[block], numbers.dt
     if leads:
         if first == 0:
@@ -603,7 +599,7 @@ def _haptic_step(
         _set_volumes(first, stride, model, work)
         _wait(grid)
         if first == 0:
-            # Between two waits in which no thread reads them.
+            # No thread reads them between these two barriers.
             for flag in range(PASSED + 1):
                 flags[flag] = 0
         _set_tensions(first, stride, model, lane, work)
@@ -637,7 +633,7 @@ def _haptic_step(
 
 
 def _end_step(model, lane, work, state, shapes, response, law, numbers, wrench, block, scratch):
-    """The lag of friction, and the mean wrench."""
+    """Lag of friction, and mean wrench."""
     listed, stretch = scratch.listed[block], state.contact_stretch[lane]
     if law.friction > 0.0:
         for slot in range(cuda.threadIdx.x, QUADRATURE_COUNT * scratch.flags[block, ENTRY_COUNT], cuda.blockDim.x):
@@ -654,7 +650,7 @@ def _end_step(model, lane, work, state, shapes, response, law, numbers, wrench, 
 def _advance(
     grid, leads, first, stride, model, lane, pool, state, tools, law, numbers, block, scratch, shared
 ):  # fmt: skip
-    """The haptic steps of one organ; its numbers are in `pool`, sums of threads in `shared`."""
+    """Haptic steps of one organ, with its numbers in `pool` and sums of threads in `shared`."""
     nodes, tets, springs = state.node_position.shape[1], model.tet_nodes.shape[0], model.spring_nodes.shape[0]
     # A device function cannot return a view of an array.
     work = Working(
@@ -697,13 +693,13 @@ def _advance(
 
 
 def _keep_lowest(state, lane, lowest):
-    """The smallest of what all threads have seen: a minimum is the same in any order."""
+    """Smallest volume ratio of all threads: a minimum does not depend on the order."""
     if not lowest >= state.volume_ratio_smallest[lane]:
         cuda.atomic.min(state.volume_ratio_smallest, lane, lowest)
 
 
 def advance_lanes(model, state, scratch, tools, law, numbers):
-    """Advance each organ that has no fault; a block takes one after the other."""
+    """Advance each organ without fault; a block takes its organs in turn."""
     block, thread, threads = cuda.blockIdx.x, cuda.threadIdx.x, cuda.blockDim.x
     shared = cuda.shared.array(0, REAL_TYPE)
     pool = shared[6 * threads :] if SHARED else scratch.pool[block]
@@ -717,7 +713,7 @@ def advance_lanes(model, state, scratch, tools, law, numbers):
 
 
 def advance_organ(model, state, scratch, tools, law, numbers):
-    """Advance one organ by all blocks together, whose first does contact."""
+    """Advance one organ by all blocks together; the first does contact."""
     shared = cuda.shared.array(0, REAL_TYPE)
     if state.fault[0] == FAULT_NONE:
         _advance(

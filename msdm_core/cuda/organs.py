@@ -1,4 +1,4 @@
-"""Organs of one mesh side by side on a CUDA device: their arrays there, and the calls that advance them."""
+"""Vectorised organs of one mesh on a CUDA device: arrays and launches."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ from msdm_core.kernels.structure_kernels import (
     OrganState,
 )
 
-# Fields of a model that each lane has of its own.
+# Fields of a model with a value for each lane.
 OWN = ("node_mass", "node_inverse_mass", "node_bulk", "spring_stiffness", "tet_bulk", "tet_averaged_bulk")
 KEPT = ("node_position", "node_velocity", "contact_engaged", "contact_stretch", "contact_passed")
 # Threads of a block, and registers of a multiprocessor.
@@ -40,15 +40,15 @@ THREADS, REGISTERS = 512, 2**16
 
 
 def check_device() -> None:
-    """Refuse to go on without a CUDA device.
+    """Require a CUDA device.
 
     Raises:
-        RuntimeError: there is none, or no driver or compiler for it.
+        RuntimeError: no device, or no driver or compiler for it.
     """
     if not cuda.is_available():
         raise RuntimeError(
-            "no CUDA device can be used: `nvidia-smi` must list one, and CUDA's compiler must be there, such as by "
-            'pip install "numba-cuda[cu13]"; device="cpu" needs neither'
+            "no usable CUDA device: `nvidia-smi` must list a device, and CUDA's compiler must be installed, for "
+            'instance by pip install "numba-cuda[cu13]"; device="cpu" needs neither'
         )
 
 
@@ -60,15 +60,15 @@ def shared_memory() -> int:
 
 
 def multiprocessors() -> int:
-    """How many multiprocessors the device has; the simulator has one."""
+    """Number of multiprocessors of the device; 1 for the simulator."""
     return 1 if SIMULATED else cuda.get_current_device().MULTIPROCESSOR_COUNT
 
 
-def with_shared_memory(kernel: Any, given: tuple[Any, ...], size: int) -> Any:
-    """A kernel compiled for some arguments, which may take more shared memory than 48 KiB."""
+def with_shared_memory(kernel: Any, arguments: tuple[Any, ...], size: int) -> Any:
+    """Kernel compiled for its arguments with more shared memory than 48 KiB, `size` [bytes]."""
     if SIMULATED:
         return kernel
-    special = kernel.specialize(*given)
+    special = kernel.specialize(*arguments)
     compiled = next(iter(special.overloads.values()))._codelibrary.get_cufunc()
     attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
     handle, device = driver.CUkernel(int(compiled.handle)), cuda.get_current_device().id
@@ -79,7 +79,7 @@ def with_shared_memory(kernel: Any, given: tuple[Any, ...], size: int) -> Any:
 
 
 def incidence(items: NDArray[np.integer], count: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """How many items (n, m) have each node, and which entries of `items.ravel()` they are: (count,), (count, most)."""
+    """Number of items (n, m) at each node, and their indices in `items.ravel()`: (count,), (count, most)."""
     nodes = items.ravel()
     order = np.argsort(nodes, kind="stable")
     number = np.bincount(nodes, minlength=count)
@@ -90,17 +90,17 @@ def incidence(items: NDArray[np.integer], count: int) -> tuple[NDArray[np.int32]
 
 
 def topology(organ: OrganModel, dtype: Any) -> dict[str, NDArray]:
-    """The fields of `DeviceModel` that lanes share."""
+    """Fields of `DeviceModel` common to all lanes."""
     nodes, tets, springs = len(organ.node_mass), organ.tet_nodes, organ.spring_nodes
     index = np.uint16 if max(nodes, len(tets), len(springs)) < 2**16 else np.int32
     tet_count, tet_entries = incidence(tets, nodes)
-    # The face opposite to each corner, which its gradient turns around: of a, b, c, d.
+    # Corners of the face opposite to a, b, c and d, in the order of the gradient.
     opposite = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
-    which, corner = tet_entries // 4, tet_entries % 4
-    node_tets = np.concatenate([which[..., None], tets[which[..., None], opposite[corner]]], axis=2)
+    tet, corner = tet_entries // 4, tet_entries % 4
+    node_tets = np.concatenate([tet[..., None], tets[tet[..., None], opposite[corner]]], axis=2)
     spring_count, spring_entries = incidence(springs, nodes)
-    which, end = spring_entries // 2, spring_entries % 2
-    node_springs = np.stack([which, springs[which, 1 - end]], axis=2)
+    spring, end = spring_entries // 2, spring_entries % 2
+    node_springs = np.stack([spring, springs[spring, 1 - end]], axis=2)
     facet_count, facets = incidence(organ.surface_triangles, nodes)
     outer = np.flatnonzero(facet_count)
     foundation = np.full(nodes, -1, dtype=np.int32)
@@ -128,7 +128,7 @@ def topology(organ: OrganModel, dtype: Any) -> dict[str, NDArray]:
 
 
 def check_organ(organ: OrganModel) -> None:
-    """Refuse an organ with parts that a device does not compute.
+    """Refuse an organ with parts beyond the device's kernels.
 
     Raises:
         OrganError: names the part.
@@ -140,12 +140,13 @@ def check_organ(organ: OrganModel) -> None:
         "a ground that moves": len(organ.motion_node_shift) > 0,
         "Rayleigh's beta": organ.beta > 0.0,
     }
-    if there := [name for name, value in parts.items() if value]:
-        raise OrganError(f'a CUDA device does not compute {there[0]}: advance this organ with device="cpu"')
+    for name, is_present in parts.items():
+        if is_present:
+            raise OrganError(f'a CUDA device does not compute {name}: advance this organ with device="cpu"')
 
 
 class DeviceArrays(NamedTuple):
-    """The arrays of organs on a device, as they are made on the host: no organ is in any lane."""
+    """Arrays of organs for a device, on the host, with all lanes empty."""
 
     model: DeviceModel
     state: DeviceState
@@ -156,7 +157,7 @@ class DeviceArrays(NamedTuple):
     def of(
         cls, organ: OrganModel, lanes: int, shapes: ContactShapes, dtype: Any, *, blocks: int, threads: int, room: int
     ) -> "DeviceArrays":
-        """Arrays for organs with the mesh of one; `room` numbers of each block are outside of shared memory."""
+        """Arrays for organs of one mesh, with `room` numbers of each block outside of shared memory."""
         nodes, tets = len(organ.node_mass), len(organ.tet_nodes)
         surface, shape_count, tools = len(organ.surface_triangles), len(shapes.shape_radius), len(shapes.tool_centre)
         slots = shape_count * surface
@@ -214,14 +215,14 @@ class DeviceArrays(NamedTuple):
 
 
 def _on_device(record: Any) -> Any:
-    """A record of arrays with copies of them on the device."""
+    """Copy of a record of arrays on the device."""
     return type(record)(*(cuda.to_device(array) for array in record))
 
 
 class DeviceOrgans:
     """Organs of one mesh on a device, each with its moduli, masses, state and tools.
 
-    One haptic step or several are one launch: a block of threads advances an organ, or all blocks one organ.
+    A launch is one haptic step or several: a block of threads advances an organ, or all blocks a single organ.
     """
 
     def __init__(
@@ -238,23 +239,23 @@ class DeviceOrgans:
         registers: int | None = None,
         block_count: int | None = None,
     ) -> None:
-        """Take arrays on the device; all lanes are empty until `put`.
+        """Allocate arrays on the device; all lanes are empty until `put`.
 
         Args:
             organ: with the mesh, anchors and foundations of all lanes.
-            lane_count: how many organs.
+            lane_count: number of organs.
             shapes: of the tools of one lane.
             contact: law of all lanes.
             dt: substep [s].
             substep_count: substeps in a haptic step.
             dtype: np.float32 or np.float64.
             threads: of a block, a power of 2.
-            registers: of a thread; as many as a multiprocessor has for one block by default.
-            block_count: blocks; by default as many as the device runs at a time, at most one for each lane.
+            registers: of a thread; by default all of a multiprocessor for one block.
+            block_count: blocks; by default all that run at a time, at most one for each lane.
 
         Raises:
-            RuntimeError: there is no CUDA device.
-            OrganError: parts of an organ that a device does not compute.
+            RuntimeError: no CUDA device.
+            OrganError: parts of an organ beyond the device's kernels.
         """
         check_device()
         check_organ(organ)
@@ -287,7 +288,7 @@ class DeviceOrgans:
         )
 
     def put(self, organs: Sequence[OrganModel], states: Sequence[OrganState]) -> None:
-        """Put organs of the same mesh with their states into all lanes, in turn where there are fewer than lanes."""
+        """Put organs of the same mesh with their states into all lanes, repeated in turn."""
         lanes = np.arange(self.lane_count) % len(organs)
         for name in OWN:
             self._write(getattr(self.model, name), np.stack([getattr(organ, name) for organ in organs])[lanes])
@@ -302,7 +303,7 @@ class DeviceOrgans:
         array.copy_to_device(np.ascontiguousarray(values.astype(array.dtype)))
 
     def put_tools(self, lane_shapes: ContactShapes, response: Any) -> None:
-        """Where the tools of all lanes are, and how they yield: as of `advance_lanes`, the lane as first index."""
+        """Place the tools of all lanes, with their response; arrays as of `advance_lanes`, the lane as first index."""
         pairs = {
             "ends": lane_shapes.shape_ends,
             "span": lane_shapes.shape_span,
@@ -315,12 +316,9 @@ class DeviceOrgans:
             self._write(getattr(self.tools, name), values)
 
     def advance(self, step_count: int = 1) -> None:
-        """Advance all lanes that have no fault by some haptic steps; returns before they are done."""
-        dt, decay, substeps = self._numbers
-        given = (
-            self.model, self.state, self.scratch, self.tools, self.law,
-            StepNumbers(dt, decay, substeps, step_count),
-        )  # fmt: skip
+        """Advance all lanes without fault by `step_count` haptic steps; returns before they are done."""
+        numbers = StepNumbers(*self._numbers, step_count)
+        arguments = (self.model, self.state, self.scratch, self.tools, self.law, numbers)
         if self._ready is None:
-            self._ready = with_shared_memory(self._kernel, given, self.shared_bytes)
-        self._ready[self.block_count, self.threads, 0, self.shared_bytes](*given)
+            self._ready = with_shared_memory(self._kernel, arguments, self.shared_bytes)
+        self._ready[self.block_count, self.threads, 0, self.shared_bytes](*arguments)

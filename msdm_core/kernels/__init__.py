@@ -1,4 +1,4 @@
-"""Compiled functions of the organ's substep, alone and in lanes."""
+"""Compiled functions of the organ's substep, for an organ alone or vectorised in lanes."""
 
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, QUADRATURE_WEIGHT
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO

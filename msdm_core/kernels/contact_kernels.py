@@ -1,4 +1,4 @@
-"""Contact of the surface of an organ with the shapes that tools carry: broad phase, pressure and friction."""
+"""Contact of the surface of an organ with the shapes of tools: broad phase, pressure and friction."""
 
 import math
 
@@ -8,13 +8,13 @@ from numba import njit
 from msdm_core.kernels.element_kernels import corner_gradient, edge
 from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 
-# Room for tissue that moves towards a shape between two broad phases [m]: 1 mm in a 1 ms haptic step is 1 m/s.
+# Margin for the motion of tissue towards a shape between two broad phases [m]: 1 mm in a haptic step of 1 ms is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
 
-# A point nearer than this share of its size to the border of a core counts as on the border (rounding).
+# Width of a core's border, as a share of the core's size (rounding).
 BORDER = 1e-12
 
-# Four quadrature points a surface triangle: centroids of its four congruent parts, equal weights.
+# Four quadrature points per surface triangle: centroids of its four congruent parts, equal weights.
 QUADRATURE_COUNT = 4
 QUADRATURE_WEIGHT = 0.25
 QUADRATURE_BARYCENTRIC = np.array(
@@ -29,8 +29,8 @@ QUADRATURE_BARYCENTRIC = np.array(
 # A row of `contact_rows`, one engaged quadrature point: slope of its penetration g with its three corners, norms of
 # those slopes, weighted area, pressure, unit vector e, stretch.
 ROW_SLOPE, ROW_NORM, ROW_AREA, ROW_PRESSURE, ROW_OUT, ROW_STRETCH = 0, 9, 12, 13, 14, 17
-# Then what `hold_contact` needs of it: speed of the tool along the slopes and at the point, 1 / (1 + h) along and
-# across, what it has added to pressure and stretch, and what it adds in one sweep.
+# Then for `hold_contact`: speed of the tool along the slopes and at the point, 1 / (1 + h) along and across, the
+# change of pressure and stretch so far, and the change in one sweep.
 ROW_TOOL, ROW_GIVE, ROW_MORE, ROW_STEP = 20, 24, 26, 30
 ROW_WIDTH = 34
 # A row of `contact_places`: shape, number of the point, nodes of its corners.
@@ -41,7 +41,7 @@ SWEEPS = (1.0, 2.0, 2.0)
 
 @njit(**INLINED)
 def reach_margin(shapes, shape, duration):
-    """How far tissue and a shape may come nearer to each other within a duration [m]."""
+    """Largest approach of tissue and a shape within a duration [m]."""
     tool = shapes.shape_tool[shape]
     speed = shapes.shape_radius[shape] * 0.0
     for part in range(6):
@@ -61,7 +61,7 @@ def core_box(ends, spans, shape, around):
 
 @njit(**INLINED)
 def is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
-    """Whether a shape may touch a triangle, by `core_box` and spheres, or holds it already."""
+    """True if a shape may touch a triangle, by `core_box` and spheres, or is in contact with it."""
     a = surface[triangle, 0]
     b = surface[triangle, 1]
     c = surface[triangle, 2]
@@ -81,17 +81,17 @@ def is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius
 
 @njit(**INNER)
 def find_candidates(model, state, shapes, duration):
-    """Broad phase of one call: the triangles that a shape may touch within a duration, by bounding boxes and spheres.
+    """Broad phase: candidate triangles of each shape within a duration, by bounding boxes and spheres.
 
-    Contact with a triangle that moves faster than the margin begins one haptic step later; an engaged triangle always
-    stays a candidate.
+    Contact with a triangle faster than the margin begins one haptic step later; an engaged triangle always stays a
+    candidate.
 
     Model: model: surface_triangles (n_surface, 3)
     In:    state: node_position [m] (n_node, 3), contact_engaged (n_shape, n_surface * 4), shapes, duration [s]
-    Out:   state: contact_candidates, a row for each shape that ends with -1 (n_shape, n_surface)
-    Returns the number of candidates of the shape that has the most.
+    Out:   state: contact_candidates, a row for each shape, ended by -1 (n_shape, n_surface)
+    Returns the largest number of candidates of a shape.
     """
-    # Arrays are taken out of the structures before the loops: inside, each access would cost a reference count.
+    # Arrays are read from the structures before the loops: inside, each access would cost a reference count.
     position, ends, spans, surface = state.node_position, shapes.shape_ends, shapes.shape_span, model.surface_triangles
     engaged, candidates = state.contact_engaged, state.contact_candidates
     most = 0
@@ -111,7 +111,7 @@ def find_candidates(model, state, shapes, duration):
 
 @njit(**INLINED)
 def stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz):
-    """Stretch of a spring across a normal that sticks to a surface: u + dt v, without its part along n.
+    """Stretch of a tangential spring in static friction: u + dt v, without its part along the normal n.
 
     In: u: stretch before [m], v: relative velocity [m/s], dt [s], n: unit normal
     Returns u [m], three numbers.
@@ -125,14 +125,14 @@ def stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz):
 
 @njit(**INLINED)
 def slipped(ux, uy, uz, longest):
-    """Factor on a stretch u [m] that slips where it is longer than `longest` = mu p / k_t [m] (Coulomb); at most 1."""
+    """Factor on a stretch u [m] for slip at a length above `longest` = mu p / k_t [m] (Coulomb); at most 1."""
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     return longest / length if length > longest else 1.0
 
 
 @njit(**INLINED)
 def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
-    """`stretched`, then shortened to `longest` [m] where it slips."""
+    """`stretched`, then shortened to `longest` [m] by slip."""
     ux, uy, uz = stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz)
     kept = slipped(ux, uy, uz, longest)
     return kept * ux, kept * uy, kept * uz
@@ -140,10 +140,10 @@ def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
 
 @njit(**INLINED)
 def may_meet(position, surface, engaged, ends, spans, shape, triangle, radius):
-    """Whether a shape holds a triangle, or could meet one of its points now."""
+    """True if a shape is in contact with a triangle, or may contain one of its points now."""
     if _is_held(engaged, shape, triangle):
         return True
-    # Only points inside the shape can be met, and they lie within half of that radius around the middle.
+    # Quadrature points lie within half of that radius around the middle.
     a, b, c = surface[triangle, 0], surface[triangle, 1], surface[triangle, 2]
     x, y, z, size_squared = _middle(position, a, b, c)
     px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
@@ -176,7 +176,7 @@ def press_point(
     """Contact of one quadrature point with one shape, see `add_contact_forces`.
 
     Out: engaged, stretch_memory: of the point; `row` of rows and places, if it is engaged
-    Returns whether it is.
+    Returns True if it is engaged.
     """
     a, b, c, bx, by, bz, cx, cy, cz, nx, ny, nz, twice_area = facet
     ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
@@ -203,21 +203,20 @@ def press_point(
         _release(engaged, stretch_memory, shape, item)
         return False
     engaged[shape, item] = 1
-    # e: unit vector against the ball's own normal where the line along n leaves the ball.
+    # e: unit vector against the ball's own normal at the exit of the line along n.
     ex = (s * nx - rx) / radius
     ey = (s * ny - ry) / radius
     ez = (s * nz - rz) / radius
     pressure = law.stiffness * s * depth / radius
 
-    # Slope of g at the point: (s^2 n - (2 s + t) rho) / (s r), without the directions in which the nearest
-    # point of the core follows.
+    # Slope of g at the point: (s^2 n - (2 s + t) rho) / (s r), without the directions along the core.
     scale = 1.0 / (s * radius)
     gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
     gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
     gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
     gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
 
-    # The normal turns when the corners move: dn = -sum grad(lambda_a) (n . dx_a); its share of the slope
+    # Rotation of the normal with the corners: dn = -sum grad(lambda_a) (n . dx_a); its share of the slope
     # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
     turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
     turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
@@ -225,7 +224,7 @@ def press_point(
     tb = turn * turn_b
     tc = turn * turn_c
 
-    # Friction: a tangential spring that follows the surface and turns with the tool.
+    # Friction: a tangential spring moving with the surface and turning with the tool.
     ux = stretch_memory[shape, item, 0]
     uy = stretch_memory[shape, item, 1]
     uz = stretch_memory[shape, item, 2]
@@ -265,7 +264,7 @@ def press_point(
 
 @njit(**INLINED)
 def first_push(rows, row, law):
-    """Pressure times area of a point [N], and the force of its friction [N], as `press_point` left them."""
+    """Pressure times area of a point [N] and its friction force [N], from `press_point`."""
     drag = rows[row, ROW_AREA] * law.tangential_stiffness
     ux, uy, uz = rows[row, ROW_STRETCH] * drag, rows[row, ROW_STRETCH + 1] * drag, rows[row, ROW_STRETCH + 2] * drag
     return rows[row, ROW_AREA] * rows[row, ROW_PRESSURE], ux, uy, uz
@@ -273,24 +272,24 @@ def first_push(rows, row, law):
 
 @njit(**INNER)
 def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference, wrench):
-    """Contact forces of every shape on its candidate triangles as they are now, and the reaction on the tools.
+    """Contact forces of every shape on its candidate triangles at present, and the reaction on the tools.
 
-    Each quadrature point is held off by a penetration that keeps rising with depth. With d from the shape's core to the
-    point, n the surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2) the half chord, the line through the
-    point along n leaves the ball t + s below the point. The energy per area is (k_p / 2) g^2 with g = s (s + t) / r: to
-    first order the radial penetration r - |d|, yet growing without bound as the ball sinks below the surface, where a
-    radial one falls again and lets the ball tunnel. Forces are its exact gradient, the turning of n with the corners
+    The penetration of a quadrature point keeps rising with depth. With d from the shape's core to the point, n the
+    surface normal, t = d . n, rho = d - t n and s = sqrt(r^2 - rho^2) the half chord, the line through the point along
+    n leaves the ball t + s below the point. The energy per area is (k_p / 2) g^2 with g = s (s + t) / r: to first order
+    the radial penetration r - |d|, yet growing without bound as the ball sinks below the surface; a radial penetration
+    would fall again there, and the ball would tunnel. Forces are its exact gradient, the rotation of n with the corners
     included, so that action and reaction balance, torque too. Friction pulls with k_t times the stretch.
-    A point engages where the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays
-    engaged until it parts, so that the far side of a thin organ is never taken for the near one.
-    `hold_contact` must follow: it adds what pressure and friction change until the end of the substep.
+    A point engages when the shape first meets it from outside (s + t > 0 with t < 0 inside the ball) and stays engaged
+    until separation, so that the far side of a thin organ is never taken for the near side.
+    `hold_contact` must follow, for the change of pressure and friction until the end of the substep.
 
     Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,); law
     In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_candidates; shapes, dt [s],
            candidate_count, reference: point of each tool's torque [m] (n_tool, 3)
     Out:   state: node_force, added to [N] (n_node, 3), contact_engaged (n_shape, n_surface * 4), contact_stretch [m]
            (n_shape, n_surface * 4, 3), contact_rows, contact_places; wrench, added to [N, N m] (n_tool, 6)
-    Returns how many points are engaged: rows of contact_rows and contact_places.
+    Returns the number of engaged points: rows of contact_rows and contact_places.
     """
     position, velocity, force = state.node_position, state.node_velocity, state.node_force
     engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
@@ -314,7 +313,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 ):  # fmt: skip
                     continue
                 push, ux, uy, uz = first_push(rows, count, law)
-                # A loop: written out, each constant number of a corner would be compiled for itself.
+                # A loop: unrolled by hand, the call would be compiled for each constant corner.
                 for corner in range(3):
                     node, weight = places[count, 2 + corner], QUADRATURE_BARYCENTRIC[point, corner]
                     _push_corner(
@@ -336,7 +335,7 @@ def hold_rates(law, dt):
 
 @njit(**INLINED)
 def hold_share(rows, number, corner, weight, along, across, dt):
-    """What a point holds one of its corners with, times dt^2 [kg]."""
+    """Hold of a point on one of its corners, times dt^2 [kg]."""
     total = rows[number, ROW_NORM] + rows[number, ROW_NORM + 1] + rows[number, ROW_NORM + 2]
     share = max(along * total * rows[number, ROW_NORM + corner], across * weight)
     return dt * rows[number, ROW_AREA] * share
@@ -344,7 +343,7 @@ def hold_share(rows, number, corner, weight, along, across, dt):
 
 @njit(**INLINED)
 def begin_hold(position, shapes, rows, places, number):
-    """Speed of the tool along a point's slopes and at the point, and nothing added to pressure and stretch yet."""
+    """Start of a point's hold: tool speed along its slopes and at the point, no change of pressure and stretch yet."""
     centre, twist = shapes.tool_centre, shapes.tool_twist
     point = places[number, 1] % QUADRATURE_COUNT
     tool = shapes.shape_tool[places[number, 0]]
@@ -375,7 +374,7 @@ def begin_hold(position, shapes, rows, places, number):
 
 @njit(**INLINED)
 def set_give(rows, places, hold, inverse_mass, number):
-    """1 / (1 + h) of a point, along its slopes and across them."""
+    """Set 1 / (1 + h) of a point, along its slopes and across them."""
     point = places[number, 1] % QUADRATURE_COUNT
     held = 0.0
     stuck = 0.0
@@ -386,14 +385,14 @@ def set_give(rows, places, hold, inverse_mass, number):
         held += rows[number, ROW_NORM + corner] * share
         stuck += QUADRATURE_BARYCENTRIC[point, corner] * share
         total += rows[number, ROW_NORM + corner]
-    # A point whose force has no direction (in the core of a shape) has no rate either.
+    # In the core of a shape a point's force has no direction, and the point no rate.
     rows[number, ROW_GIVE] = total / (total + held) if total > 0.0 else 0.0
     rows[number, ROW_GIVE + 1] = 1.0 / (1.0 + stuck)
 
 
 @njit(**INLINED)
 def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, decay, rows, places, number, sweep):
-    """What one sweep adds to pressure and stretch of a point; the last one writes the stretch of a point that slips."""
+    """One sweep's change of a point's pressure and stretch; the last sweep stores the stretch of a slipping point."""
     along = law.stiffness * dt + law.damping
     shape = places[number, 0]
     item = places[number, 1]
@@ -420,7 +419,7 @@ def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, 
     more = max(more, -pressure)
     rows[number, ROW_MORE] = more
     rows[number, ROW_STEP] = more - before
-    # The stretch of the last sweep, and from there on to that of the velocities.
+    # From the stretch of the last sweep towards that of the velocities.
     ux = rows[number, ROW_STRETCH] + rows[number, ROW_MORE + 1]
     uy = rows[number, ROW_STRETCH + 1] + rows[number, ROW_MORE + 2]
     uz = rows[number, ROW_STRETCH + 2] + rows[number, ROW_MORE + 3]
@@ -448,7 +447,7 @@ def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, 
 
 @njit(**INLINED)
 def more_push(rows, number, law):
-    """What the last sweep added: pressure times area [N], and the force of friction [N]."""
+    """Change in the last sweep: pressure times area [N] and friction force [N]."""
     push = rows[number, ROW_AREA] * rows[number, ROW_STEP]
     drag = rows[number, ROW_AREA] * law.tangential_stiffness
     return push, drag * rows[number, ROW_STEP + 1], drag * rows[number, ROW_STEP + 2], drag * rows[number, ROW_STEP + 3]
@@ -456,19 +455,19 @@ def more_push(rows, number, law):
 
 @njit(**INNER)
 def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wrench):
-    """Make contact implicit: pressure and friction of each quadrature point at the END of the substep.
+    """Implicit contact: pressure and friction of each quadrature point at the END of the substep.
 
-    `add_contact_forces` has applied k_p g and k_t u. The pressure at the end has q = (k_p dt + c_p) g' more, the
-    friction k_t dt u', with the rates g', u' of the velocities that follow from all forces. Sweeps over the points
-    approach it: each adds w (q - what was added so far) / (1 + h), w = 1, 2, 2 (`SWEEPS`), and all of them read the
-    forces that the sweep before has left, so that their order does not matter. h is the mean over the corners of
-    H_a / m_a, with H_a = dt sum (k_p dt + c_p) A |dg/dx_a| sum_b |dg/dx_b| over the points around a node (k_t dt A
-    times its weight where that is more): a point has that share of a node's mass which it has of what holds the node
-    (mass splitting, Tonge, Benevolenski and Voroshilov 2012). The velocities then follow as from larger masses, which
-    are symmetric: contact gives no energy, and `stability.contact_excess` bounds what it asks of the step.
+    `add_contact_forces` has applied k_p g and k_t u. The pressure at the end is larger by q = (k_p dt + c_p) g', the
+    friction by k_t dt u', with the rates g', u' of the velocities after all forces. Sweeps over the points approach it:
+    each adds w (q - the sum so far) / (1 + h), w = 1, 2, 2 (`SWEEPS`), and all points read the forces after the
+    previous sweep, so that their order does not matter. h is the mean over the corners of H_a / m_a, with
+    H_a = dt sum (k_p dt + c_p) A |dg/dx_a| sum_b |dg/dx_b| over the points around a node (or, if larger, k_t dt A times
+    its weight): a point's share of a node's mass is its share of the node's hold (mass splitting, Tonge, Benevolenski
+    and Voroshilov 2012). The velocities are then those of larger masses, which are symmetric: contact gives no energy,
+    and `stability.contact_excess` bounds its part of the step's limit.
     At rest under balanced forces nothing is added: an equilibrium does not depend on dt.
-    A pressure does not become negative; friction is cut at mu times the pressure that then acts (Coulomb). Tools keep
-    the velocity that they have at the start of the substep.
+    A pressure does not become negative; friction is at most mu times the final pressure (Coulomb). Tools keep their
+    velocity at the start of the substep.
 
     Model: model: node_inverse_mass [1/kg] (n_node,); law
     In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_rows and contact_places of
@@ -517,14 +516,14 @@ def _extent(ends, spans, shape, axis, around):
 
 @njit(**INLINED)
 def _overlap(position, axis, a, b, c, low, high):
-    """Whether a triangle reaches into an interval of one coordinate."""
+    """True if a triangle reaches into an interval of one coordinate."""
     first, second, third = position[a, axis], position[b, axis], position[c, axis]
     return max(first, second, third) >= low and min(first, second, third) <= high
 
 
 @njit(**INLINED)
 def _mean(values, a, b, c, wa, wb, wc):
-    """Three nodes' values by their weights."""
+    """Weighted mean of three nodes' values."""
     x = wa * values[a, 0] + wb * values[b, 0] + wc * values[c, 0]
     y = wa * values[a, 1] + wb * values[b, 1] + wc * values[c, 1]
     z = wa * values[a, 2] + wb * values[b, 2] + wc * values[c, 2]
@@ -545,7 +544,7 @@ def tool_velocity(twist, centre, tool, x, y, z):
 
 @njit(**INLINED)
 def _middle(position, a, b, c):
-    """Centroid of a triangle [m], and the square of the radius around it that holds its corners [m^2]."""
+    """Centroid of a triangle [m], and the squared radius of the sphere around it through the farthest corner [m^2]."""
     x = (position[a, 0] + position[b, 0] + position[c, 0]) / 3.0
     y = (position[a, 1] + position[b, 1] + position[c, 1]) / 3.0
     z = (position[a, 2] + position[b, 2] + position[c, 2]) / 3.0
@@ -557,7 +556,7 @@ def _middle(position, a, b, c):
 
 @njit(**INLINED)
 def _is_held(engaged, shape, triangle):
-    """Whether a shape holds any point of a triangle."""
+    """True if any point of a triangle is in contact with a shape."""
     first = triangle * QUADRATURE_COUNT
     for point in range(first, first + QUADRATURE_COUNT):
         if engaged[shape, point]:
@@ -567,7 +566,7 @@ def _is_held(engaged, shape, triangle):
 
 @njit(**INLINED_KERNEL)
 def closest_on_axis(ends, shape, x, y, z):
-    """The point of the axis of a shape that is nearest to a point.
+    """Point of a shape's axis nearest to a point.
 
     In: ends of axes [m] (n_shape, 2, 3), shape: its number, x, y, z: the point [m]
     Returns three coordinates [m].
@@ -587,7 +586,7 @@ def closest_on_axis(ends, shape, x, y, z):
 
 @njit(**INLINED)
 def closest_on_core(ends, spans, shape, x, y, z):
-    """The point of the core of a shape that is nearest to a point: on its axis, and across it in a rounded box.
+    """Point of a shape's core nearest to a point: on its axis, or across it in a rounded box.
 
     In: ends of axes [m] (n_shape, 2, 3), spans across them [m] (n_shape, 3), shape: its number, x, y, z: the point [m]
     Returns three coordinates [m].
@@ -607,7 +606,7 @@ def closest_on_core(ends, spans, shape, x, y, z):
 
 @njit(**INLINED)
 def _release(engaged, stretch_memory, shape, item):
-    """Forget the contact of one quadrature point with one shape."""
+    """End the contact of one quadrature point with one shape."""
     engaged[shape, item] = 0
     stretch_memory[shape, item, 0] = 0.0
     stretch_memory[shape, item, 1] = 0.0
@@ -624,7 +623,7 @@ def _put_slope(rows, number, corner, weight, along_n, gx, gy, gz, nx, ny, nz):
 
 @njit(**INLINED)
 def corner_force(rows, number, corner, push, weight, ux, uy, uz):
-    """One corner's share of a point's force, -push dg/dx - weight u [N]."""
+    """Corner's share of a point's force, -push dg/dx - weight u [N]."""
     return (
         -push * rows[number, ROW_SLOPE + 3 * corner] - weight * ux,
         -push * rows[number, ROW_SLOPE + 3 * corner + 1] - weight * uy,
@@ -634,7 +633,7 @@ def corner_force(rows, number, corner, push, weight, ux, uy, uz):
 
 @njit(**INLINED)
 def _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz):
-    """One corner's share of a point's force, and the reaction to it."""
+    """Add a corner's share of a point's force, and its reaction."""
     fx, fy, fz = corner_force(rows, number, corner, push, weight, ux, uy, uz)
     force[node, 0] += fx
     force[node, 1] += fy
@@ -644,7 +643,7 @@ def _push_corner(position, force, reference, wrench, tool, node, rows, number, c
 
 @njit(**INLINED)
 def react(wrench, reference, tool, x, y, z, fx, fy, fz):
-    """Take a force on the tissue at a point, and its torque about the reference, from the wrench on a tool."""
+    """Subtract a force on the tissue at a point, and its torque about the reference, from the wrench on a tool."""
     x -= reference[tool, 0]
     y -= reference[tool, 1]
     z -= reference[tool, 2]
@@ -658,7 +657,7 @@ def react(wrench, reference, tool, x, y, z, fx, fy, fz):
 
 @njit(**INLINED)
 def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
-    """Drop the part along a shape's core in which the nearest point (px, py, pz) lies strictly between its borders."""
+    """Remove the part of g along a shape's core, if the nearest point (px, py, pz) lies strictly inside its borders."""
     ux = ends[shape, 1, 0] - ends[shape, 0, 0]
     uy = ends[shape, 1, 1] - ends[shape, 0, 1]
     uz = ends[shape, 1, 2] - ends[shape, 0, 2]
@@ -687,7 +686,7 @@ def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
 
 @njit(**INLINED)
 def lag_point(position, surface, stretch, shapes, response, shape, triangle, point):
-    """Shift the stretch of one point by its tool's lag."""
+    """Shift the stretch of a point by its tool's lag."""
     tool, item = shapes.shape_tool[shape], triangle * QUADRATURE_COUNT + point
     centre, lag = shapes.tool_centre, response.tool_lag
     ox = -centre[tool, 0]
@@ -705,7 +704,7 @@ def lag_point(position, surface, stretch, shapes, response, shape, triangle, poi
 
 @njit(**INNER)
 def stretch_by_lag(model, state, shapes, response, candidate_count):
-    """Shift the stretch of sticking friction by each tool's lag, to where MuJoCo puts the tool at the end of the step.
+    """Shift the stretch of static friction by each tool's lag behind its place in MuJoCo at the end of the step.
 
     Model: model: surface_triangles (n_surface, 3)
     In:    state: node_position [m] (n_node, 3), contact_engaged, contact_candidates; shapes: tool_centre [m]

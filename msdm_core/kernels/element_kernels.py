@@ -1,7 +1,7 @@
-"""The equations of one spring and one tet, for numbers or vectors of them; compiled into every loop over them.
+"""Equations of a spring and a tet, for numbers or vectors of them; inlined into every loop over them.
 
 Without fastmath nothing is fused or reordered: an organ alone, an organ among others and the same equations in numpy
-agree to the bit where they add in the same order.
+agree to the bit if sums have the same order.
 """
 
 from numba import njit
@@ -9,21 +9,20 @@ from numba import njit
 from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL
 from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 
-# Below this volume ratio s a tet also bears the share K' of its volume term that is averaged at nodes, by a pressure
-# that steepens: an average alone lets single tets collapse between swollen neighbours. Its energy
-# K' s V0 ((J - s) - s ln(J / s)) is unbounded at J = 0. With a linear term instead, tets inverted at 50 to 80 % of the
-# force.
+# Below this volume ratio s a tet also has a barrier pressure for the share K' of its volume term averaged at nodes: an
+# average alone lets single tets collapse between swollen neighbours. Its energy K' s V0 ((J - s) - s ln(J / s)) is
+# unbounded at J = 0. With a linear term instead, tets inverted at 50 to 80 % of the force.
 SQUEEZED_RATIO = 0.6
-# Springs are steep where stiffening adds more than this to their tangent over that at rest: what it adds is then
-# integrated implicitly. Below, the step bears it, which `stability.stable_dt` counts.
+# Rise of a spring's tangent over that at rest above which the spring is steep: its rise is then integrated implicitly.
+# A smaller rise counts in `stability.stable_dt`.
 STEEP_EXCESS = 0.1
-# Added to a strain that is divided by.
+# Added to strains in denominators.
 STRAIN_LEAST = 1e-30
 
 
 @njit(**INLINED)
 def edge(position, a, b):
-    """From one node to another, of positions (n_node, 3) [m]."""
+    """Vector from one node to another, of positions (n_node, 3) [m]."""
     return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
 
 
@@ -61,7 +60,7 @@ def strain_square(energy, softness):
 
 @njit(**INLINED_KERNEL)
 def node_law(square, onset, growth, excess):
-    """Half the factor w'(s) / s of a node's springs on their linear tension, and what their tangent w'' is above 1.
+    """Half of a node's factor w'(s) / s on linear tension, and the rise w'' - 1 of its tangent.
 
     (1 + (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) / s) / 2 and (c - 1) v^2, with u = (s - e0) / (e1 - e0) and v its part
     within 0, 1.
@@ -78,7 +77,7 @@ def node_law(square, onset, growth, excess):
 
 @njit(**INLINED)
 def faded_share(duration, time):
-    """Share of its tension that a Maxwell arm loses, 1 - exp(-x), x = duration / time, by exp's series to x^4.
+    """Relative loss of tension in a Maxwell arm, 1 - exp(-x), x = duration / time, by exp's series to x^4.
 
     A rational function has the same bits on every machine; below x = 0.1 it is exact to 1e-7, and it stays within 0 and
     1 for any x.
@@ -89,7 +88,7 @@ def faded_share(duration, time):
 
 @njit(**INLINED)
 def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
-    """Force over length that Rayleigh's beta adds to a spring, k beta (dl/dt) / l.
+    """Force over length of Rayleigh's beta in a spring, k beta (dl/dt) / l.
 
     In: d: from one end to the other [m], v: difference of their velocities [m/s], stiffness k [N/m], beta [s]
     Returns [N/m].
@@ -141,14 +140,14 @@ def six_rates(b, c, d, b_rate, c_rate, d_rate):
 def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
     """Factor from `corner_gradient` to the forces of a tet on its corners: minus a sixth of its tension.
 
-    The tension is K (J - 1), plus the mean tension of the volumes averaged at its corners, plus, where J is below
-    s = SQUEEZED_RATIO, K' (J - s) s / J.
+    The tension is K (J - 1), plus the mean tension of the volumes averaged at its corners, plus K' (J - s) s / J for J
+    below s = SQUEEZED_RATIO.
 
     In: ratio J, bulk K [Pa], averaged_bulk K' [Pa], averaged_tension [Pa]
     Returns [Pa].
     """
     tension = bulk * (ratio - 1.0) + averaged_tension
-    # A quotient takes as long as ten products: only where there is something to add.
+    # A quotient takes as long as ten products.
     if any_below(ratio, SQUEEZED_RATIO):
         tension = tension + averaged_bulk * (below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio))
     return tension * (-1.0 / 6.0)

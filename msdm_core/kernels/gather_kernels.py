@@ -1,7 +1,7 @@
-"""Numbers of the nodes of a group of items, springs or tets, as vectors with one entry an item; and sums back.
+"""Gathering of node values into vectors with an entry per item (spring or tet) of a group, and scattered sums.
 
-Each function writes its loads, shuffles and stores straight into LLVM's code, as many as a group has items. Stores of
-an item precede loads of the next: items of a group may share nodes, and their sums have the order of a plain loop.
+Each function emits its loads, shuffles and stores as LLVM code, as many as a group has items. Stores of an item precede
+loads of the next: items of a group may share nodes, and their sums have the order of a plain loop.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from numba.core import cgutils
 
 from msdm_core.kernels.vector_kernels import GROUP, VectorType, intrinsic
 
-# Of a float64: saved states come back wherever numpy puts them.
+# Of a float64: arrays of saved states have no larger alignment.
 _ALIGNMENT = 8
 _INDEX, _INT32, _DOUBLE = ir.IntType(64), ir.IntType(32), ir.DoubleType()
 _ROW, _PAIR, _VECTOR = ir.VectorType(_DOUBLE, 4), ir.VectorType(_DOUBLE, 2), ir.VectorType(_DOUBLE, GROUP)
@@ -23,7 +23,7 @@ VECTOR, ROW = VectorType(types.float64, GROUP), VectorType(types.float64, 4)
 
 
 class _Group:
-    """Writes what is done with the nodes of a group of items, from item `first` on, of an array (n_item, corners)."""
+    """Code for the nodes of a group of items, from item `first` on, of an array (n_item, corners)."""
 
     def __init__(self, context: Any, builder: ir.IRBuilder, kind: Any, items: Any, first: Any, corners: int) -> None:
         self.builder, self.corners = builder, corners
@@ -40,7 +40,7 @@ class _Group:
 
 
 class _Numbers:
-    """The numbers of an array that has `width` of them a node, at the corners of a group's items."""
+    """Code for the numbers of an array with `width` numbers a node, at the corners of a group's items."""
 
     def __init__(self, group: _Group, context: Any, kind: Any, array: Any, width: int) -> None:
         self._group, self._width = group, width
@@ -59,17 +59,17 @@ class _Numbers:
 
     def add(self, item: int, corner: int, value: Any, column: int = 0) -> None:
         """Add to what `load` reads."""
-        more = self._builder.fadd(self.load(item, corner, value.type, column), value)
-        self._builder.store(more, self._place(item, corner, column, value.type), align=_ALIGNMENT)
+        total = self._builder.fadd(self.load(item, corner, value.type, column), value)
+        self._builder.store(total, self._place(item, corner, column, value.type), align=_ALIGNMENT)
 
     def take(self, item: int, corner: int, value: Any) -> None:
         """Subtract from what `load` reads."""
-        less = self._builder.fsub(self.load(item, corner, value.type), value)
-        self._builder.store(less, self._place(item, corner, 0, value.type), align=_ALIGNMENT)
+        difference = self._builder.fsub(self.load(item, corner, value.type), value)
+        self._builder.store(difference, self._place(item, corner, 0, value.type), align=_ALIGNMENT)
 
 
 def _shuffle(builder: ir.IRBuilder, pair: Sequence[Any], places: Sequence[int]) -> Any:
-    """Entries of two vectors, one after the other, by place."""
+    """Entries of two joined vectors, by place."""
     return builder.shuffle_vector(pair[0], pair[1], ir.Constant(ir.VectorType(_INT32, len(places)), list(places)))
 
 
@@ -85,7 +85,7 @@ def _entry(builder: ir.IRBuilder, vector: Any, place: int) -> Any:
 
 
 def _columns(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
-    """Rows (x, y, z, -), one an item, as vectors of x, y and z."""
+    """Rows (x, y, z, -) of items as vectors of x, y and z."""
     pairs = ((rows[0], rows[1]), (rows[2], rows[3]))
     even = [_shuffle(builder, pair, _EVEN) for pair in pairs]
     odd = [_shuffle(builder, pair, _ODD) for pair in pairs]
@@ -93,26 +93,26 @@ def _columns(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
 
 
 def _rows(builder: ir.IRBuilder, columns: Sequence[Any]) -> list[Any]:
-    """Vectors of x, y and z as rows (x, y, z, 0), one an item."""
+    """Vectors of x, y and z as rows (x, y, z, 0) of items."""
     x, y, z = columns
-    nothing = ir.Constant(_VECTOR, [0.0] * GROUP)
+    zeros = ir.Constant(_VECTOR, [0.0] * GROUP)
     # x0, y0, x2, y2 and z0, 0, z2, 0; then those of items 1 and 3.
-    even, odd = ([_shuffle(builder, pair, places) for pair in ((x, y), (z, nothing))] for places in (_EVEN, _ODD))
+    even, odd = ([_shuffle(builder, pair, places) for pair in ((x, y), (z, zeros))] for places in (_EVEN, _ODD))
     return [_shuffle(builder, pairs, half) for half in (_LOW, _HIGH) for pairs in (even, odd)]
 
 
 def _define_read(corners: int, width: int, result: Any, write: Callable[..., Any]) -> Any:
-    """A function of an array, of items and of a group's first item that returns vectors.
+    """Function of an array, of items and of a group's first item with vectors as result; `write` emits its code.
 
-    `write` writes its code. Arrays have `width` numbers a node and `corners` nodes an item, one after the other.
+    Arrays have `width` numbers a node and `corners` nodes an item, in sequence.
     """
 
     @intrinsic
     def read(_typing: Any, values: Any, items: Any, first: Any) -> Any:
-        def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
-            group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
-            written = write(builder, _Numbers(group, context, signature.args[0], given[0], width))
-            return written if result == VECTOR else _tuple(context, builder, result, written)
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+            group = _Group(context, builder, signature.args[1], arguments[1], arguments[2], corners)
+            vectors = write(builder, _Numbers(group, context, signature.args[0], arguments[0], width))
+            return vectors if result == VECTOR else _tuple(context, builder, result, vectors)
 
         return result(values, items, types.intp), generate
 
@@ -120,18 +120,15 @@ def _define_read(corners: int, width: int, result: Any, write: Callable[..., Any
 
 
 def _define_add(corners: int, width: int, write: Callable[..., None]) -> Any:
-    """A function of an array, of items, of a group's first item and of vectors that adds these up in the array.
-
-    Otherwise as `_define_read`.
-    """
+    """Function of an array, of items, of a group's first item and of vectors, added to the array; as `_define_read`."""
 
     @intrinsic
     def add(_typing: Any, values: Any, items: Any, first: Any, vectors: Any) -> Any:
-        def generate(context: Any, builder: ir.IRBuilder, signature: Any, given: Any) -> Any:
-            group = _Group(context, builder, signature.args[1], given[1], given[2], corners)
-            numbers = _Numbers(group, context, signature.args[0], given[0], width)
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+            group = _Group(context, builder, signature.args[1], arguments[1], arguments[2], corners)
+            numbers = _Numbers(group, context, signature.args[0], arguments[0], width)
             several = isinstance(vectors, types.BaseTuple)
-            write(builder, numbers, _entries(builder, signature.args[3], given[3]) if several else given[3])
+            write(builder, numbers, _entries(builder, signature.args[3], arguments[3]) if several else arguments[3])
             return context.get_dummy_value()
 
         return types.none(values, items, types.intp, vectors), generate
@@ -188,13 +185,13 @@ def _add_at_ends(builder: ir.IRBuilder, pairs: _Numbers, energy: Any) -> None:
             pairs.add(item, corner, _entry(builder, energy, item), 1)
 
 
-# Of an array of rows (x, y, z, 0): the row from end 0 to end 1 of each spring.
+# Rows from end 0 to end 1 of each spring, from rows (x, y, z, 0).
 edge_rows = _define_read(2, 4, types.UniTuple(ROW, GROUP), _edge_rows)
-# Of pairs of numbers: the sum of the second numbers of the two ends.
+# Sums of the second numbers of the two ends, from pairs.
 end_sums = _define_read(2, 2, VECTOR, _end_sums)
-# To rows: `edge_rows` times a vector (both are given) at end 0, taken away at end 1.
+# Arguments rows and a vector: their product added to the rows of end 0, subtracted from those of end 1.
 pull_ends = _define_add(2, 4, _pull_ends)
-# To the second numbers of pairs: a vector at both ends.
+# A vector added to the second numbers of the pairs of both ends.
 add_at_ends = _define_add(2, 2, _add_at_ends)
 
 
@@ -204,8 +201,7 @@ def columns(_typing: Any, rows: Any) -> Any:
     result = types.UniTuple(VECTOR, 3)
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
-        (given,) = values
-        return context.make_tuple(builder, result, _columns(builder, cgutils.unpack_tuple(builder, given)))
+        return context.make_tuple(builder, result, _columns(builder, cgutils.unpack_tuple(builder, values[0])))
 
     return result(rows), generate
 
@@ -252,23 +248,23 @@ def _add_at_corners(builder: ir.IRBuilder, total: _Numbers, six: Any) -> None:
 
 
 def _add_pairs(builder: ir.IRBuilder, pairs: _Numbers, vectors: Any) -> None:
-    nothing = ir.Constant(_VECTOR, [0.0] * GROUP)
+    zeros = ir.Constant(_VECTOR, [0.0] * GROUP)
     for item in range(GROUP):
         places = (item, item + GROUP)
-        at_ends, elsewhere = _shuffle(builder, vectors, places), _shuffle(builder, (vectors[0], nothing), places)
+        at_ends, elsewhere = _shuffle(builder, vectors, places), _shuffle(builder, (vectors[0], zeros), places)
         for corner, value in enumerate((at_ends, at_ends, elsewhere, elsewhere)):
             pairs.add(item, corner, value)
 
 
-# Of an array of rows (x, y, z, 0): vectors of x, y and z from corner 0 of each tet to its corners 1, 2 and 3.
+# Vectors of x, y and z from corner 0 of each tet to its corners 1, 2 and 3, from rows (x, y, z, 0).
 tet_edges = _define_read(4, 4, types.UniTuple(types.UniTuple(VECTOR, 3), 3), _tet_edges)
-# Of an array of numbers: their sum over the corners.
+# Sums over the corners, from numbers.
 corner_sums = _define_read(4, 1, VECTOR, _corner_sums)
-# Of pairs of numbers: the sum of the first over the corners, and of the second over the ends of the tet's spring.
+# Sums of the first numbers over the corners, and of the second over the ends of the tet's spring, from pairs.
 pair_sums = _define_read(4, 2, types.UniTuple(VECTOR, 2), _pair_sums)
-# To rows: vectors of x, y and z at each of the corners 1, 2 and 3, whose sum is taken away at corner 0.
+# Vectors of x, y and z added to the rows of the corners 1, 2 and 3, their sum subtracted at corner 0.
 push_corners = _define_add(4, 4, _push_corners)
-# To numbers: a vector at all corners.
+# A vector added to the numbers of all corners.
 add_at_corners = _define_add(4, 1, _add_at_corners)
-# To pairs of numbers: a vector at all corners to the first, another at the ends of the tet's spring to the second.
+# A vector added to the first numbers of all corners' pairs, another to the second numbers at the tet's spring's ends.
 add_pairs = _define_add(4, 2, _add_pairs)

@@ -1,4 +1,4 @@
-"""The guard that keeps the surface of an organ off the axes of the shapes, and detects where one passed through."""
+"""Guard of the shapes' axes: a force that keeps the surface of an organ off them, and detection of passage."""
 
 import math
 from typing import NamedTuple
@@ -9,25 +9,25 @@ from msdm_core.kernels.contact_kernels import closest_on_axis, react, tool_veloc
 from msdm_core.kernels.element_kernels import corner_gradient, edge
 from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
 
-# The surface is kept this share of a shape's radius away from its axis; ordinary presses stay far from it.
+# Reach of the guard around a shape's axis, as a share of its radius; ordinary presses stay far from it.
 GUARD_SHARE = 0.6
-# Half a thousandth of a triangle is taken for its edge, so that nothing slips through between two.
+# Width of an edge, as a share of its triangle, so that nothing slips between two triangles.
 EDGE_WIDTH = 5e-4
-# Where a triangle is to the axis of a shape.
+# Positions of a triangle relative to the axis of a shape.
 FAR, NEAR, PASSED = 0, 1, 2
 PI = math.pi
 
 
 class _NearPoint(NamedTuple):
-    """The point of a triangle that is nearest to the axis of a shape, SI units.
+    """Point of a triangle nearest to the axis of a shape, SI units.
 
     Fields:
         corners: the triangle's nodes                                            3
-        weights: what each of them counts at the point                           3
-        place: where the point is [m]                                            3
+        weights: of the corners at the point                                     3
+        place: of the point [m]                                                  3
         direction: unit vector from the axis to it                               3
         distance: between them [m]
-        reach: distance below which the guard pushes [m]
+        reach: of the guard [m]
         stiffness: of the guard [N/m]
     """
 
@@ -42,18 +42,18 @@ class _NearPoint(NamedTuple):
 
 @njit(**INNER)
 def guard_axes(model, state, shapes, law, response, dt, candidate_count, reference, wrench):
-    """Keep the surface off the axes of the shapes, which the quadrature points alone may let pass.
+    """Force that keeps the surface off the axes of the shapes.
 
-    Where a ball is small against a triangle, the surface opens between its quadrature points. So the point of each
-    triangle nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = 0.6 r, with
-    k = pi r^2 k_p: nothing at h, without bound at the axis. It is taken implicitly, with the nodes' masses and the
-    tool's mobility, so that it asks for no shorter step; it must therefore come after all other forces.
+    A ball that is small against a triangle slips between its quadrature points. Therefore the point of each triangle
+    nearest to the axis, at the distance d, is pushed away from it by k h (h / d - 1) below h = 0.6 r, with
+    k = pi r^2 k_p: 0 at h, unbounded at the axis. The force is implicit, with the nodes' masses and the tool's
+    mobility, so that it does not shorten the step; it must therefore come after all other forces.
 
     Model: model: surface_triangles (n_surface, 3), node_inverse_mass [1/kg] (n_node,); law, response
     In:    state: node_position [m], node_velocity [m/s] (n_node, 3), contact_candidates; shapes, dt [s],
            candidate_count, reference: point of each tool's torque [m] (n_tool, 3)
     Out:   state: node_force, added to [N] (n_node, 3), contact_passed (2,); wrench, added to [N, N m] (n_tool, 6)
-    Returns whether the surface is on its side of every axis.
+    Returns True if no axis has passed through the surface.
     """
     position, velocity = state.node_position, state.node_velocity
     candidates, surface = state.contact_candidates, model.surface_triangles
@@ -76,18 +76,18 @@ def guard_axes(model, state, shapes, law, response, dt, candidate_count, referen
 
 @njit(**INLINED)
 def watched_distance(shapes, dt, shape):
-    """How near to an axis the surface is watched [m]: the guard's reach, and what the axis may pass in a substep."""
+    """Largest watched distance from an axis [m]: the guard's reach, and the axis' path in a substep."""
     tool = shapes.shape_tool[shape]
     watched = GUARD_SHARE * shapes.shape_radius[shape]
     for part in range(6):
-        # The broad phase's bound on its speed.
+        # As the broad phase bounds its speed.
         watched += dt * abs(shapes.tool_twist[tool, part])
     return watched
 
 
 @njit(**INLINED)
 def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, watched):
-    """Where a triangle is to the axis of a shape: FAR, NEAR or PASSED, and if it is near, its point next to the axis.
+    """Position of a triangle relative to a shape's axis, FAR, NEAR or PASSED; if near, its point next to the axis.
 
     In: position [m], velocity [m/s] (n_node, 3), surface (n_surface, 3), shapes, law, dt [s], watched [m]
     """
@@ -114,7 +114,7 @@ def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, wat
         return FAR, far
     if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, a, b, c):
         return PASSED, far
-    # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, near for a shaft.
+    # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, approximate for a shaft.
     wb, wc = closest_in_triangle(
         bx, by, bz, cx, cy, cz,
         ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
@@ -128,7 +128,7 @@ def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, wat
     ey = y - py
     ez = z - pz
     distance = math.sqrt(ex * ex + ey * ey + ez * ez)
-    # Behind the triangle, beyond one of its edges: another one stands between.
+    # Behind the triangle, beyond an edge: another triangle lies between.
     if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
         return FAR, far
     direction = (ex / distance, ey / distance, ez / distance)
@@ -139,7 +139,7 @@ def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, wat
 
 @njit(**INLINED)
 def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near):
-    """The guard's push on a point of a triangle, with the speed and mobility that it has in this substep.
+    """Guard's force on a point of a triangle, with its speed and mobility in this substep.
 
     Model: model, response
     In:    shapes: twist and centre of the tool [m, rad, s], dt [s], reference [m] (n_tool, 3), tool, near
@@ -185,7 +185,7 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
 
 @njit(**INNER)
 def _passed(shapes, shape, position, velocity, dt, a, b, c):
-    """Whether an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
+    """True if an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
     ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
     highest, highest_b, highest_c = 0.0, 0.0, 0.0
     lowest, lowest_b, lowest_c = 0.0, 0.0, 0.0
@@ -210,7 +210,7 @@ def _passed(shapes, shape, position, velocity, dt, a, b, c):
 
 @njit(**INLINED)
 def _foot(x, y, z, position, velocity, dt, a, b, c):
-    """Of a point over a triangle as it was dt ago: height [m], and its foot's weights of the corners b and c."""
+    """Height of a point over a triangle dt ago [m], and its foot's weights of the corners b and c."""
     ax = position[a, 0] - dt * velocity[a, 0]
     ay = position[a, 1] - dt * velocity[a, 1]
     az = position[a, 2] - dt * velocity[a, 2]
@@ -232,7 +232,7 @@ def _foot(x, y, z, position, velocity, dt, a, b, c):
 
 @njit(**INLINED)
 def _is_inside(high, high_b, high_c, low, low_b, low_c):
-    """Whether the way from a height above a triangle to one below it leads through it, its edges included."""
+    """True if the path from a height above a triangle to a height below leads through it, its edges included."""
     share = high / (high - low)
     wb = high_b + share * (low_b - high_b)
     wc = high_c + share * (low_c - high_c)
@@ -241,7 +241,7 @@ def _is_inside(high, high_b, high_c, low, low_b, low_c):
 
 @njit(**INLINED_KERNEL)
 def closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
-    """The point of a triangle that is nearest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
+    """Point of a triangle nearest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
 
     In: b, c: edges from the corner a [m], p: from the corner a to the point [m]
     Returns the weights of the corners b and c.

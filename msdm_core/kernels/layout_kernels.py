@@ -1,10 +1,10 @@
-"""How numbers of nodes, springs and tets lie in memory: of an organ alone, and of organs side by side.
+"""Memory layout of nodes, springs and tets, for an organ alone and for vectorised organs in lanes.
 
-`lanes` is a tuple as long as there are organs side by side; their number is thereby part of the compiled type. One
+The length of the tuple `lanes` is the number of organs side by side, and thereby part of the compiled type. One
 register then holds the same number of every organ (8 of float64, 16 or 8 of float32): arrays are (n_item, n_lane) and
-(n_node, 3, n_lane), and nothing is gathered or scattered. For an organ alone `lanes` is empty: arrays are (n_item,) of
-numbers and (n_node, 4) of float64, whose rows of x, y, z and nothing load as one register. Which of the two holds is
-known when a function is compiled, which drops the other branch of each `if len(lanes) == 0`.
+(n_node, 3, n_lane), without gathering and scattering. For an organ alone `lanes` is empty: arrays are (n_item,) of
+numbers and (n_node, 4) of float64, with rows of x, y, z and padding that load as one register. The layout is known at
+compile time, so that the other branch of each `if len(lanes) == 0` disappears.
 """
 
 import numpy as np
@@ -12,6 +12,7 @@ from numba import njit
 
 from msdm_core.kernels.option_kernels import ALLOCATING_KERNEL, INLINED
 from msdm_core.kernels.vector_kernels import (
+    GROUP,
     define_extract,
     keep_lower,
     load_lanes,
@@ -25,8 +26,16 @@ _at_0, _at_1, _at_2 = define_extract(0), define_extract(1), define_extract(2)
 
 
 @njit(**INLINED)
+def group_width(lanes):
+    """Number of tets or springs in a row that an entry of `squeezed_tets` or `steep_springs` stands for."""
+    if len(lanes) == 0:
+        return GROUP
+    return 1
+
+
+@njit(**INLINED)
 def load_item(lanes, values, item):
-    """An item's number, or the vector of all organs' numbers of it."""
+    """Number of an item, or vector of all organs' numbers."""
     if len(lanes) == 0:
         return values[item]
     return load_lanes(lanes, values, item)
@@ -34,7 +43,7 @@ def load_item(lanes, values, item):
 
 @njit(**INLINED)
 def store_item(lanes, values, item, value):
-    """Write what `load_item` reads."""
+    """Store for `load_item`."""
     if len(lanes) == 0:
         values[item] = value
     else:
@@ -43,7 +52,7 @@ def store_item(lanes, values, item, value):
 
 @njit(**INLINED)
 def load_shared(lanes, like, values, item):
-    """`load_item` of an array that organs may share: then (n_item,) for all of them; of the type of `like`."""
+    """`load_item` of an array of the type of `like`, (n_item,) if all organs share it."""
     if len(lanes) == 0:
         return values[item]
     return load_or_spread(lanes, like, values, item)
@@ -51,10 +60,10 @@ def load_shared(lanes, like, values, item):
 
 @njit(**INLINED)
 def load_half(lanes, pairs, node, half):
-    """The first (0) or the second (1) of a node's two numbers, in an array (n_node, 2) or (2, n_node, n_lane).
+    """First (0) or second (1) of a node's two numbers, in an array (n_node, 2) or (2, n_node, n_lane).
 
-    Of an organ alone both load as one register; of organs side by side each is a line of the cache, and those that are
-    read together stand together.
+    For an organ alone both load as one register; for organs side by side each is a line of the cache, and numbers read
+    together stand together.
     """
     if len(lanes) == 0:
         return pairs[node, half]
@@ -63,7 +72,7 @@ def load_half(lanes, pairs, node, half):
 
 @njit(**INLINED)
 def store_half(lanes, pairs, node, half, value):
-    """Write what `load_half` reads."""
+    """Store for `load_half`."""
     if len(lanes) == 0:
         pairs[node, half] = value
     else:
@@ -72,13 +81,13 @@ def store_half(lanes, pairs, node, half, value):
 
 @njit(**INLINED)
 def add_half(lanes, pairs, node, half, value):
-    """Add to what `load_half` reads."""
+    """Addition to the number of `load_half`."""
     store_half(lanes, pairs, node, half, load_half(lanes, pairs, node, half) + value)
 
 
 @njit(**INLINED)
 def load_column(lanes, values, width, item, column):
-    """One number of an item's row, or the vector of all organs' numbers, of an array (n_item, width, n_lane).
+    """Number of an item's row, or vector of all organs' numbers, of an array (n_item, width, n_lane).
 
     An organ alone may have wider rows than `width`.
     """
@@ -89,7 +98,7 @@ def load_column(lanes, values, width, item, column):
 
 @njit(**INLINED)
 def store_column(lanes, values, width, item, column, value):
-    """Write what `load_column` reads."""
+    """Store for `load_column`."""
     if len(lanes) == 0:
         values[item, column] = value
     else:
@@ -98,7 +107,7 @@ def store_column(lanes, values, width, item, column, value):
 
 @njit(**INLINED)
 def parts_of(lanes):
-    """How many registers hold a node's x, y and z."""
+    """Number of registers for a node's x, y and z."""
     if len(lanes) == 0:
         return 1
     return 3
@@ -106,7 +115,7 @@ def parts_of(lanes):
 
 @njit(**INLINED)
 def load_part(lanes, values, part):
-    """A register of an array of nodes; those of node i are i * parts_of(lanes) and on."""
+    """Register of an array of nodes; node i begins at i * parts_of(lanes)."""
     if len(lanes) == 0:
         return load_row(values, part)
     return load_lanes(lanes, values, part)
@@ -114,7 +123,7 @@ def load_part(lanes, values, part):
 
 @njit(**INLINED)
 def store_part(lanes, values, part, value):
-    """Write what `load_part` reads."""
+    """Store for `load_part`."""
     if len(lanes) == 0:
         store_row(values, part, value)
     else:
@@ -123,7 +132,7 @@ def store_part(lanes, values, part, value):
 
 @njit(**INLINED)
 def store_sum(lanes, total, value):
-    """Write a sum over `load_part` into an array (1,) or (1, n_lane); of a row its three numbers added up."""
+    """Store a sum over `load_part` in an array (1,) or (1, n_lane), for a row the sum of its three numbers."""
     if len(lanes) == 0:
         total[0] = (_at_0(value) + _at_1(value)) + _at_2(value)
     else:
@@ -132,7 +141,7 @@ def store_sum(lanes, total, value):
 
 @njit(**INLINED)
 def where_moving(lanes, moving, after, before):
-    """For each organ the value `after` where it moves (1 in `moving`), else `before`."""
+    """Value `after` of each moving organ (1 in `moving`), `before` of the others."""
     if len(lanes) == 0:
         return after
     moves = load_lanes(lanes, moving, 0)
@@ -141,7 +150,7 @@ def where_moving(lanes, moving, after, before):
 
 @njit(**INLINED)
 def difference(lanes, values, items, item, corner):
-    """From corner 0 of an item to another of its corners, of an array of nodes: x, y and z."""
+    """Vector from corner 0 of an item to another corner, of an array of nodes: x, y and z."""
     if len(lanes) == 0:
         a, b = items[item, 0], items[item, corner]
         return values[b, 0] - values[a, 0], values[b, 1] - values[a, 1], values[b, 2] - values[a, 2]
@@ -155,7 +164,7 @@ def difference(lanes, values, items, item, corner):
 
 @njit(**INLINED)
 def three_edges(lanes, values, tets, tet):
-    """From corner 0 of a tet to its other three."""
+    """Vectors from corner 0 of a tet to its other three corners."""
     return (
         difference(lanes, values, tets, tet, 1),
         difference(lanes, values, tets, tet, 2),
@@ -179,7 +188,7 @@ def add_to_node(lanes, force, node, x, y, z):
 
 @njit(**INLINED)
 def take_from_node(lanes, force, node, x, y, z):
-    """Take x, y and z from a node's force."""
+    """Subtract x, y and z from a node's force."""
     if len(lanes) == 0:
         force[node, 0] -= x
         force[node, 1] -= y
@@ -201,9 +210,9 @@ def add_to_corners(lanes, total, tets, tet, value):
 
 @njit(**INLINED)
 def add_volume_and_energy(lanes, pairs, tets, tet, volume, energy):
-    """Add to the first numbers of the pairs at a tet's corners, and to the second ones at the ends of its spring.
+    """Add to the first numbers of the pairs at a tet's corners, and to the second numbers at the ends of its spring.
 
-    All are loaded before one is stored: compiled code keeps the order of what might be the same place.
+    All loads come before the stores: the compiler cannot know that the places differ.
     """
     a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
     volume_a, volume_b = load_half(lanes, pairs, a, 0) + volume, load_half(lanes, pairs, b, 0) + volume
@@ -237,17 +246,16 @@ def corner_mean(lanes, values, tets, tet):
 
 @njit(**ALLOCATING_KERNEL)
 def spread_order(items, base, gap, waiting, last, order):
-    """The base order, changed so that items that share a node stand apart.
+    """Change of a base order that keeps items of a common node apart.
 
-    Each place takes the first of the next n_waiting items whose nodes were used at least `gap` places before; else the
-    one whose nodes were used longest ago.
+    Each place takes the first of the next n_waiting items without a node in the last `gap` places; failing that, the
+    item with the least recent nodes.
 
     In:  items: their nodes (n_item, 2 or 4), base: an order (n_item,), gap
-    Out: waiting: scratch (n_waiting,), last: the place where each node was used last, initially -gap (n_node,),
-         order (n_item,)
+    Out: waiting: scratch (n_waiting,), last: last place of each node, initially -gap (n_node,), order (n_item,)
     """
     count, held = base.shape[0], min(waiting.shape[0], base.shape[0])
-    # Entry by entry: for slices numba compiles a message that states both shapes, which takes a second.
+    # Entry by entry: for slices numba would compile an error message with both shapes, which takes a second.
     for entry in range(held):
         waiting[entry] = base[entry]
     for place in range(count):

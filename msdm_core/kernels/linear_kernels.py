@@ -1,4 +1,4 @@
-"""The forces of an organ linearised at rest."""
+"""Forces of an organ linearised at rest."""
 
 import numpy as np
 from numba import njit

@@ -1,7 +1,8 @@
-"""What tissue bears: contact pressure and principal strain, averaged at nodes.
+"""Load of the tissue, contact pressure and principal strain, averaged at nodes.
 
-Single quadrature points and tets feel the mesh: a ball rests on the nodes below it first. At a cell / contact radius of
-0.6 averages at nodes are within 11 % of axisymmetric finite elements, those of points and tets up to 50 % too large.
+Values at single quadrature points and tets depend on the mesh: a ball rests on the nodes below it first. At a cell /
+contact radius of 0.6 averages at nodes are within 11 % of axisymmetric finite elements, values at points and tets up to
+50 % too large.
 """
 
 import math
@@ -20,7 +21,7 @@ from msdm_core.kernels.option_kernels import KERNEL
 
 @njit(**KERNEL)
 def add_pressures(model, state, shapes, stiffness, push):
-    """Contact force of every node if each were pushed along the normal: sum of w A k_p g (`add_contact_forces`).
+    """Contact force of each node as if along the normal: sum of w A k_p g (`add_contact_forces`).
 
     Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,)
     In:    state: node_position [m] (n_node, 3), contact_engaged (n_shape, n_surface * 4); shapes, stiffness k_p [N/m^3]
@@ -84,7 +85,7 @@ def add_gradients(rest, position, tets, gradient):
 
 @njit(**KERNEL)
 def fill_volume_ratios(position, tets, rest_volume, ratio):
-    """Volume of every tet over its volume at rest, negative where it is inside out.
+    """Volume of each tet over its volume at rest, negative for a tet inside out.
 
     In:  position: of the nodes [m] (n_node, 3), tets (n_tet, 4), rest_volume [m^3] (n_tet,)
     Out: ratio (n_tet,)

@@ -1,14 +1,14 @@
-"""Products and decompositions of dense matrices in a fixed order of operations, unlike those of BLAS and LAPACK."""
+"""Products and decompositions of dense matrices in a fixed order of operations, unlike BLAS and LAPACK."""
 
 import numpy as np
 from numba import njit
 
 from msdm_core.kernels.option_kernels import INLINED, KERNEL
 
-# Elements beside the diagonal below this share of the norm, and angles between rows below it, count as zero.
+# Largest off-diagonal elements, as a share of the norm, and angles between rows that count as zero.
 ZERO_SHARE = 1e-17
 ANGLE_LEAST = 1e-15
-# Jacobi's method converges quadratically, in six to ten sweeps for what occurs here.
+# Jacobi's method converges quadratically, here in six to ten sweeps.
 SWEEPS_MOST = 60
 
 
@@ -31,7 +31,7 @@ def eliminate(matrices, right):
     In, out: right: b, then x (s, n, m)
 
     Returns:
-        The number of the first singular matrix, else -1.
+        Index of the first singular matrix, else -1.
     """
     count, size, width = right.shape
     for system in range(count):
@@ -67,7 +67,7 @@ def eliminate(matrices, right):
 
 @njit(**INLINED)
 def _rotation(first, second, between):
-    """Cosine and sine of Jacobi's rotation, by which [[first, between], [between, second]] becomes diagonal."""
+    """Cosine and sine of Jacobi's rotation, which makes [[first, between], [between, second]] diagonal."""
     tau = (second - first) / (2.0 * between)
     tangent = 1.0 / (abs(tau) + np.sqrt(1.0 + tau * tau))
     if tau < 0.0:
@@ -124,7 +124,7 @@ def diagonalise(matrices, vectors):
 def orthogonalise(rows, turns):
     """Rotate pairs of rows until all are orthogonal, in place (Hestenes 1958, one-sided Jacobi).
 
-    In, out: rows (m, n), then turns times what they were
+    In, out: rows (m, n), then turns times rows
     Out:     turns: an orthogonal matrix (m, m)
     """
     count, width = rows.shape

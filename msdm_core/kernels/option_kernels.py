@@ -1,26 +1,26 @@
-"""How kernels are compiled: the options of `@njit(**...)`.
+"""Options of `@njit(**...)` for kernels.
 
-Division by zero gives infinity and nan, as in numpy, and no function is wrapped for C. No memory is taken and no
-references are counted (`_nrt`, numba's runtime): a kernel that makes an array does not compile, and all compile in 0.8
-of the time. A wrapper for Python takes as long to compile as a small function: those that compiled code alone calls
-have none; numba makes machine code of them all the same, and links them into their callers. Calling one of them from
-Python ends the process (a jump to address 0); call its `py_func`.
+Division by zero gives infinity and nan, as in numpy, and no function has a wrapper for C. Without `_nrt`, numba's
+runtime, there are no allocations and no reference counts: a kernel that makes an array does not compile, and all
+compile in 0.8 of the time. A wrapper for Python takes as long to compile as a small function: functions for compiled
+callers alone have none; numba still makes machine code of them, and links them into their callers. A call of one of
+them from Python ends the process (a jump to address 0); call its `py_func`.
 """
 
 from typing import Any
 
 _ALL: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
-# Called from Python, kept on disk, and runs without the interpreter's lock.
+# Called from Python, cached on disk, run without the interpreter's lock.
 KERNEL: dict[str, Any] = {**_ALL, "cache": True, "nogil": True}
-# For `register_jitable`: a part of a kernel that runs in Python too.
+# For `register_jitable`: a part of a kernel for Python too.
 JITABLE: Any = _ALL
-# A kernel that kernels call.
+# A kernel called by kernels alone.
 INNER: dict[str, Any] = {**KERNEL, "no_cpython_wrapper": True}
-# Becomes part of each function that calls it.
+# Inlined into each caller.
 INLINED: dict[str, Any] = {**_ALL, "forceinline": True, "no_cpython_wrapper": True}
-# The same, and called from Python too.
+# Inlined, and called from Python too.
 INLINED_KERNEL: dict[str, Any] = {**_ALL, "forceinline": True}
-# The same as INLINED of a function that returns a view of an array, which numba takes for a new array.
+# Inlined, with a view of an array as result, which numba takes for a new array.
 INLINED_VIEW: dict[str, Any] = {**INLINED, "_nrt": True}
-# A kernel outside of the substep that makes arrays.
+# A kernel outside of the substep with arrays of its own.
 ALLOCATING_KERNEL: dict[str, Any] = {**KERNEL, "_nrt": True}

@@ -1,7 +1,7 @@
-"""Rays against triangles (Moeller and Trumbore 1997): visibility, thickness, self-crossing.
+"""Intersections of rays and triangles (Moeller and Trumbore 1997): visibility, thickness, self-crossing.
 
-Lines of a grid against a closed surface are not here: `mesh.surface.line_hits` decides on which side of an edge a line
-passes once per edge, so that no line slips between two triangles.
+Lines of a grid against a closed surface are in `mesh.surface.line_hits`: it decides a line's side of an edge once per
+edge, so that no line slips between two triangles.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from msdm_core.kernels.option_kernels import INLINED, KERNEL
 
 @njit(**INLINED)
 def ray_hit(ox, oy, oz, dx, dy, dz, bx, by, bz, cx, cy, cz):
-    """Where a ray meets a triangle, in multiples of d from its origin; not a number where it passes beside it.
+    """Intersection of a ray with a triangle, in multiples of d from its origin; nan without an intersection.
 
     In: o: from the triangle's corner a to the origin of the ray [m], d: the ray, b and c: edges from a [m]
     """
@@ -28,11 +28,10 @@ def ray_hit(ox, oy, oz, dx, dy, dz, bx, by, bz, cx, cy, cz):
 
 @njit(**KERNEL)
 def nearest_hits(origins, directions, corners, least, distance):
-    """The nearest triangle that each of some rays meets.
+    """Distance to the nearest triangle along each ray.
 
-    In:  origins [m], directions: unit vectors (n, 3), corners of triangles [m] (m, 3, 3), least: hits nearer than this
-         [m] are left out
-    Out: distance to the nearest hit, infinite without one [m] (n,)
+    In:  origins [m], directions: unit vectors (n, 3), corners of triangles [m] (m, 3, 3), least: smallest distance [m]
+    Out: distance to the nearest hit, infinite without a hit [m] (n,)
     """
     for ray in range(origins.shape[0]):
         nearest = np.inf
@@ -45,7 +44,7 @@ def nearest_hits(origins, directions, corners, least, distance):
 
 @njit(**KERNEL)
 def pierces(origins, directions, corners, pierced):
-    """Whether each of some segments passes through the triangle of the same number.
+    """Intersection of each segment with the triangle of the same index.
 
     In:  origins, directions: from one end to the other [m] (n, 3), corners of triangles [m] (n, 3, 3)
     Out: pierced (n,)

@@ -1,4 +1,4 @@
-"""What would limit the step where tissue is strained far, integrated implicitly: squeezed tets and steep springs."""
+"""Implicit integration of squeezed tets and steep springs, which would limit the step at large strain."""
 
 from numba import njit
 
@@ -11,9 +11,11 @@ from msdm_core.kernels.element_kernels import (
     tet_shape,
     volume_ratio,
 )
+from msdm_core.kernels.lane_view_kernels import nodes_of
 from msdm_core.kernels.layout_kernels import (
     add_to_node,
     difference,
+    group_width,
     load_column,
     load_item,
     load_shared,
@@ -23,17 +25,17 @@ from msdm_core.kernels.layout_kernels import (
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
-# Implicit stiffness of a steep spring over what stiffening adds to its tangent: with a larger one fewer sweeps hold the
-# fast motions, and the slow ones become heavier. Measured on bars of springs with 60 times the tangent at rest: 8, 12
-# and 16 sweeps hold 29, 38 and 49 times that tangent at the step of the linear organ; with a factor of 1 it takes twice
+# Implicit stiffness of a steep spring over the rise of its tangent: a larger factor needs fewer sweeps for the fast
+# motions, and makes the slow motions heavier. Measured on bars of springs with 60 times the tangent at rest: 8, 12 and
+# 16 sweeps are stable up to 29, 38 and 49 times that tangent at the step of the linear organ; a factor of 1 needs twice
 # as many sweeps.
 STEEP_HOLD = 3.0
-# Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with what a pull of 1 N changes
-# the speeds of its ends by, and its pull so far.
+# Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
+# ends' speeds by a pull of 1 N, and its pull so far.
 STEEP_WIDTH = 6
 # Sweeps per tangent over that at rest, and the fewest. Measured on bars with all springs beyond the cap strain
-# (stretched by 30 %, compressed by 15 %, sheared by 40 %, slowly or at once, and let go): the step at rest holds
-# tangents of 14, 20, 29 and 38 times that at rest with 4, 6, 8 and 12 sweeps.
+# (stretched by 30 %, compressed by 15 %, sheared by 40 %, slowly or at once, and released): the step at rest is stable
+# up to tangents of 14, 20, 29 and 38 times that at rest with 4, 6, 8 and 12 sweeps.
 SWEEPS_PER_TANGENT = 1.0 / 3.0
 SWEEPS_LEAST = 4
 
@@ -42,15 +44,16 @@ SWEEPS_LEAST = 4
 def hold_squeezed(
     position, velocity, force, inverse_mass, tets, inverse_volume, averaged_bulk, squeezed, count, width, dt
 ):  # fmt: skip
-    """Make the pressure of squeezed tets implicit: tension p + dt p' dJ/dt, with the speeds at the end of the step.
+    """Implicit pressure of squeezed tets: tension p + dt p' dJ/dt, with the speeds at the end of the step.
 
     Below s = SQUEEZED_RATIO the tension p of a tet steepens, p' = K' (s / J)^2, and would limit the step. The tissue
-    kernel has applied p; this one adds the rest to each such tet in turn, from the masses of its nodes and all forces
-    so far. A tet at rest gets no force, so the static equilibrium does not depend on dt; no tension becomes positive.
+    kernel has applied p; this kernel adds the remainder to each such tet in turn, from the masses of its nodes and all
+    forces so far. A tet at rest gets no force, so the static equilibrium does not depend on dt; no tension becomes
+    positive.
 
     In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), tets (n_tet, 4), inverse_volume
-         [1/m^3], averaged_bulk [Pa] (n_tet,), squeezed: the first of each `width` tets in a row among which one is
-         squeezed (n_tet,), count: entries of `squeezed`, width, dt [s]
+         [1/m^3], averaged_bulk [Pa] (n_tet,), squeezed: first of each `width` successive tets with a squeezed tet
+         (n_tet,), count: entries of `squeezed`, width, dt [s]
     Out: force, added to [N] (n_node, 3)
     """
     for entry in range(count):
@@ -66,7 +69,7 @@ def hold_squeezed(
             gc, gd = corner_gradient(d, b), corner_gradient(b, c)
             ga = (-(gb[0] + gc[0] + gd[0]), -(gb[1] + gc[1] + gd[1]), -(gb[2] + gc[2] + gd[2]))
             gradients = (ga, gb, gc, gd)
-            # Six times the rate of the volume that follows from all forces so far, and its change for a tension of 6.
+            # Six times the rate of the volume after all forces so far, and its change for a tension of 6.
             six_rate = 0.0
             give = 0.0
             for corner in range(4):
@@ -90,7 +93,7 @@ def hold_squeezed(
 def _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, pull):
     """Change the speeds of a spring's ends by its pull [N] for one substep.
 
-    No loop over x, y and z: LLVM does not unroll it here, and sends the direction of many lanes through the stack.
+    No loop over x, y and z: LLVM would not unroll it here, and would spill the direction of many lanes to the stack.
     """
     for_i, for_j = pull * dt * load_item(lanes, inverse_mass, i), pull * dt * load_item(lanes, inverse_mass, j)
     add_to_node(lanes, speed, i, for_i * along[0], for_i * along[1], for_i * along[2])
@@ -99,7 +102,7 @@ def _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, pull):
 
 @njit(**INLINED)
 def _direction(lanes, rows, row):
-    """The direction of the spring of a row."""
+    """Direction of the spring of a row."""
     return (
         load_column(lanes, rows, STEEP_WIDTH, row, 0), load_column(lanes, rows, STEEP_WIDTH, row, 1),
         load_column(lanes, rows, STEEP_WIDTH, row, 2),
@@ -108,14 +111,14 @@ def _direction(lanes, rows, row):
 
 @njit(**INLINED)
 def _set_axis(lanes, speed, velocity, force, rate, node, axis):
-    """One axis of `_set_speed`."""
+    """`_set_speed` along one axis."""
     after = load_column(lanes, velocity, 3, node, axis) + rate * load_column(lanes, force, 3, node, axis)
     store_column(lanes, speed, 3, node, axis, after)
 
 
 @njit(**INLINED)
 def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
-    """The speed that a node gets to by all forces so far."""
+    """Set the speed of a node after all forces so far."""
     rate = dt * load_item(lanes, inverse_mass, node)
     _set_axis(lanes, speed, velocity, force, rate, node, 0)
     _set_axis(lanes, speed, velocity, force, rate, node, 1)
@@ -123,28 +126,27 @@ def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
 
 
 @njit(**KERNEL)
-def hold_steep(
-    lanes, position, velocity, force, inverse_mass, nodes, stiffness, steepness, gain, relaxes, tet_count, steep, count,
-    width, sweeps_least, sweeps_most, places, rows, speed, dt,
-):  # fmt: skip
-    """Make what stiffening adds to the tangent of steep springs implicit: tension T + dt K dl/dt at the step's end.
+def hold_steep(lanes, model, state, count, sweeps_least, dt):
+    """Implicit rise of the tangent of steep springs: tension T + dt K dl/dt at the step's end.
 
-    K = STEEP_HOLD k q (1 + sum g_i), where q is the mean of (c - 1) v^2 of both ends: the tangent of a node's energy
-    over its springs is nowhere above that of springs with q alone, which would limit the step. The tissue kernel has
-    applied T. For the springs with q above STEEP_EXCESS this one solves for the rest, p = dt K d(l)/dt with the speeds
+    K = STEEP_HOLD k q (1 + sum g_i), with q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy over
+    its springs is nowhere above that of springs with q alone, which would limit the step. The tissue kernel has applied
+    T. For the springs with q above STEEP_EXCESS this kernel solves for the remainder, p = dt K d(l)/dt with the speeds
     at the end of the step, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
     in order and in reverse in turn, from p = 0. After each pair of sweeps the result is that of symplectic Euler with
-    larger masses, M <= M' <= M + dt^2 K, symmetric, so that no energy is made; what the sweeps leave is smallest in the
-    fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A
+    larger masses, M <= M' <= M + dt^2 K, symmetric, so that no energy is made; the error of the sweeps is smallest in
+    the fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A
     spring at rest gets no force, so the static equilibrium does not depend on dt.
 
-    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), stiffness [N/m]
-         (n_spring,), steepness (n_node,) of `node_law`, gain (n_spring,) as in `OrganModel`, relaxes, tet_count:
-         springs that come with a tet, steep: the first of each `width` springs in a row among which one is steep,
-         count: entries of `steep`, width, sweeps_least, sweeps_most: even numbers, dt [s]
-    Out: force, added to [N] (n_node, 3); scratch: places (n_spring,), rows (n_spring, STEEP_WIDTH), speed [m/s]
-         (n_node, 3)
+    In:  count: entries of `steep_springs`, each the first of `group_width` successive springs with a steep spring,
+         sweeps_least: an even number as `steep_sweeps` of the model, dt [s]
+    Out: force of the nodes, added to
     """
+    position, velocity, force = nodes_of(lanes, state)
+    nodes, stiffness, inverse_mass = model.spring_nodes, model.spring_stiffness, model.node_inverse_mass
+    gain, relaxes, tet_count, width = model.spring_gain, model.relaxes, model.tet_nodes.shape[0], group_width(lanes)
+    steepness, steep, places = state.node_steepness, state.steep_springs, state.steep_places
+    rows, speed = state.steep_rows, state.steep_speed
     held = 0
     none = load_item(lanes, steepness, 0) * 0.0
     largest = none
@@ -161,7 +163,7 @@ def hold_steep(
             tangent = STEEP_HOLD * load_item(lanes, stiffness, spring) * more
             if relaxes:
                 tangent = tangent * load_shared(lanes, steepness, gain, spring)
-            # Of organs side by side each has its own steep springs.
+            # Each of several organs side by side has its own steep springs.
             tangent = keep_lower(none + STEEP_EXCESS, more, tangent, none)
             give = dt * load_item(lanes, inverse_mass, i) + dt * load_item(lanes, inverse_mass, j)
             places[held] = spring
@@ -175,7 +177,7 @@ def hold_steep(
             _set_speed(lanes, speed, velocity, force, inverse_mass, dt, j)
             held += 1
     wanted = SWEEPS_PER_TANGENT * (1.0 + largest)
-    for sweep in range(sweeps_most):
+    for sweep in range(model.steep_sweeps):
         pair = sweep - sweep % 2
         goes_on = none + 1.0
         if pair >= sweeps_least:

@@ -1,4 +1,4 @@
-"""What holds an organ: contact with solids (pressure, stick-slip friction), elastic foundations, and their motion."""
+"""Supports of an organ: contact with solids (pressure, stick-slip friction), elastic foundations, and their motion."""
 
 import math
 
@@ -14,13 +14,12 @@ PLANE, SPHERE, CAPSULE, BOX = 0, 1, 2, 3
 
 @njit(**KERNEL)
 def add_support_forces(model, ground, position, velocity, force, stretch, load, dt):
-    """Push every surface node out of the supports that it is in; two supports both push.
+    """Contact of surface nodes with supports; forces of several supports add up.
 
-    A node of area A, d deep, is held off along the solid's outward normal n with A max(0, k_p d - c n . v), and across
-    it by a spring of k_t A whose stretch follows the node and is cut where it would pull more than mu times that. The
-    stretch belongs to node and support, is zero while the node is outside, and turns with the normal.
-
-    Velocities are relative to the solid's.
+    On a node of area A at the depth d acts A max(0, k_p d - c n . v) along the solid's outward normal n, and across it
+    a spring of k_t A with a stretch that follows the node, at most mu times the normal force (Coulomb). The stretch
+    belongs to node and support, is zero while the node is outside, and turns with the normal. Velocities are relative
+    to the solid's.
 
     Model: model
     In:    ground: position [m], velocity [m/s] of the solids (n_support, 2, 3), position, velocity (n_node, 3), dt [s]
@@ -80,7 +79,7 @@ def add_support_forces(model, ground, position, velocity, force, stretch, load, 
 
 @njit(**KERNEL)
 def add_foundation_forces(nodes, ground, stiffness, position, force):
-    """Hold nodes elastically where they are without force: f = -K (x - x0).
+    """Elastic force on nodes towards their places of rest: f = -K (x - x0).
 
     In:  nodes (n_held,), ground: x0 [m] (n_held, 3), stiffness: K [N/m] (n_held, 3, 3), position [m] (n_node, 3)
     Out: force, added to [N] (n_node, 3)
@@ -98,7 +97,7 @@ def add_foundation_forces(nodes, ground, stiffness, position, force):
 
 @njit(**KERNEL)
 def place_ground(model, motion, foundation, support):
-    """Where the ground is now: x0 + sum of s_m d_m, at the speed sum of ds_m/dt d_m, over the motions m.
+    """Present place of the ground, x0 + sum of s_m d_m, and its speed, sum of ds_m/dt d_m, over the motions m.
 
     Model: model: shifts d_m
     In:    motion: signals s_m and their rates [1/s] (n_motion, 4)
@@ -139,7 +138,7 @@ def carry_anchors(model, motion, velocity):
 
 @njit(**INLINED)
 def _ground_shift(lanes, shift, number, node, part):
-    """What of a motion's shift belongs to a part of a node, see `layout_kernels.load_part`."""
+    """Part of a motion's shift of a node, see `layout_kernels.load_part`."""
     if len(lanes) == 0:
         return load_row(shift, number * shift.shape[1] + node)
     return _lanes_shift(lanes, shift, number, node, part)
@@ -147,7 +146,7 @@ def _ground_shift(lanes, shift, number, node, part):
 
 @njit(**INLINED)
 def _lanes_shift(lanes, shift, number, node, part):
-    """The number that all lanes share, or the vector of each lane's own."""
+    """Number common to all lanes, or vector of each lane's own."""
     if shift.ndim == 4:
         return load_item(lanes, shift, (number * shift.shape[1] + node) * shift.shape[2] + part)
     return shift[number, node, part]
@@ -155,12 +154,12 @@ def _lanes_shift(lanes, shift, number, node, part):
 
 @njit(**INNER)
 def drag_along(lanes, shift, rate, moving, decay, velocity):
-    """Let the integration that follows, v' = decay v + ..., damp velocities relative to the ground's.
+    """Prepare velocities for damping relative to the ground's by the integration v' = decay v + ...
 
     With its speed w = sum of ds_m/dt d_m: v' = decay (v - w) + w + ..., so that anchored nodes keep the speed w.
 
     In:  shift: d_m [m] (n_motion, n_node, 4), or with a last index n_lane each lane's own, rate: ds_m/dt [1/s]
-         (n_motion,), moving: 1 where an organ moves (1,), decay
+         (n_motion,), moving: 1 for a moving organ (1,), decay
     Out: velocity [m/s] (n_node, 4)
     """
     more, parts = (1.0 - decay) / decay, parts_of(lanes)
@@ -179,11 +178,10 @@ def drag_along(lanes, shift, rate, moving, decay, velocity):
 
 @njit(**INNER)
 def move_ground(model, position, force, foundation, load, motion, dt):
-    """Count the work of the ground on the organ, and advance the signals by a step.
+    """Add the work of the ground on the organ, and advance the signals by a step.
 
-    What the ground pushes with does the work F . d_m ds_m: F = -f at an anchored node, whose forces it balances,
-    K (x0 - x) below a foundation, and a support's load. A signal's change up to a state and the one after it count
-    half each, the trapezoidal rule: with the rates before and after, dW_m = F . d_m (r_m + r'_m) dt / 2.
+    The force F of the ground does the work F . d_m ds_m: F = -f at an anchored node, K (x0 - x) below a foundation, and
+    a support's load. By the trapezoidal rule, with the rates before and after, dW_m = F . d_m (r_m + r'_m) dt / 2.
 
     Model: model: shifts d_m
     In:    position [m] (n_node, 3), force [N] (n_node, 3), foundation [m] (n_held, 3), load [N] (n_support, 3), dt [s]
@@ -191,7 +189,7 @@ def move_ground(model, position, force, foundation, load, motion, dt):
     """
     for number in range(motion.shape[0]):
         shift = model.motion_node_shift[number]
-        # Three sums do not wait for each other.
+        # Three independent sums overlap.
         x, y, z = 0.0, 0.0, 0.0
         for item in range(model.motion_anchored_nodes.shape[0]):
             node = model.motion_anchored_nodes[item]
@@ -219,9 +217,9 @@ def move_ground(model, position, force, foundation, load, motion, dt):
 
 @njit(**INNER)
 def depth_inside(kind, first, second, third, x, y, z):
-    """Depth of a point in a solid, and the outward normal there, in the frame of the solid.
+    """Depth of a point in a solid, and the outward normal, in the frame of the solid.
 
-    In a box the normal is that of the nearest face, at the centre of a sphere or on the axis of a capsule it is x.
+    In a box the normal is that of the nearest face; at the centre of a sphere or on the axis of a capsule it is x.
 
     In: kind: PLANE, SPHERE, CAPSULE or BOX; first, second, third: radius, half length, half sizes [m]; x, y, z [m]
     Returns the depth [m], at most 0 outside, and the three components of the unit normal.

@@ -1,11 +1,11 @@
-"""Vector registers for numba: a type whose values are LLVM vectors, their arithmetic, loads, stores and shuffles.
+"""Vector registers for numba: a type of LLVM vectors, their arithmetic, loads, stores and shuffles.
 
 numba does not vectorise the organ's loops by itself: they gather and scatter, and short loops over lanes are unrolled
-before LLVM's vectoriser sees them. Here four springs, or one spring of eight organs, are worked on as one value.
-LLVM splits a vector wider than the machine's registers, so the same code runs, to the same bits, on any machine.
+before LLVM's vectoriser. Here four springs, or the springs of eight organs, are one value. LLVM splits a vector wider
+than the machine's registers, so the same code runs, to the same bits, on any machine.
 
-A kernel written with `+ - * /`, `root`, `keep_lower`, `below_zero` and `any_below` takes numbers and vectors alike: the
-equations of springs and tets stand once, in `element_kernels.py`.
+A kernel of `+ - * /`, `root`, `keep_lower`, `below_zero` and `any_below` takes numbers and vectors alike: the equations
+of springs and tets stand once, in `element_kernels.py`.
 """
 
 import math
@@ -23,16 +23,16 @@ from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import lower_builtin, register_model
 from numpy.typing import NDArray
 
-# Untyped: a compiled function is called without the typing context that an intrinsic is defined with.
+# Untyped: calls lack the typing context of an intrinsic's definition.
 intrinsic: Any = extending.intrinsic
 
-# Bytes of the widest register there is, and of a line of the cache.
+# Size of the widest registers, and of a line of the cache [bytes].
 REGISTER_SIZE = 64
-# How many springs or tets of an organ alone are worked on at a time. As many as a row has numbers, so that rows turn
-# into vectors and back by the fewest shuffles; eight took 20 % longer with AVX2, whose 16 registers they overflow, and
-# 9 % longer with AVX-512.
+# Springs or tets of an organ alone in a vector. As many as numbers in a row, so that rows turn into vectors and back
+# with the fewest shuffles; eight took 20 % longer with AVX2, as they overflow its 16 registers, and 9 % longer with
+# AVX-512.
 GROUP = 4
-# By a feature of the processor, the widest first; without one of them it is 128.
+# By features of the processor, the widest first; 128 without them.
 _REGISTER_BITS = {"avx512f": 512, "avx2": 256, "avx": 256}
 # No fusing of products and sums: the same bits on every machine, for numbers and for vectors of any width.
 FLAGS = ()
@@ -62,7 +62,7 @@ def lane_counts(dtype: Any) -> tuple[int, ...]:
 
 
 def register_bits() -> int:
-    """Width of the widest vector registers that compiled code may use [bits].
+    """Width of the widest vector registers for compiled code [bits].
 
     NUMBA_CPU_NAME and NUMBA_CPU_FEATURES decide; without them, the processor.
     """
@@ -72,7 +72,7 @@ def register_bits() -> int:
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
-    """Zeros that begin at a register's boundary; a load across two cache lines costs up to a third."""
+    """Zeros aligned to registers; a load across two cache lines costs up to a third."""
     count = math.prod(shape) * np.dtype(dtype).itemsize
     raw = np.zeros(count + REGISTER_SIZE, dtype=np.uint8)
     start = -raw.ctypes.data % REGISTER_SIZE
@@ -83,7 +83,7 @@ def aligned_zeros(shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[An
 
 
 def _spread(builder: ir.IRBuilder, value: Any, kind: ir.VectorType) -> Any:
-    """A number in every place of a vector."""
+    """Vector with a number in each place."""
     empty = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(
@@ -99,14 +99,14 @@ def _operand(context: Any, builder: ir.IRBuilder, value: Any, kind: Any, vector:
 
 
 def _common(a: Any, b: Any) -> VectorType | None:
-    """The vector type that two operands have in common, if one of them is a vector and the other goes with it."""
+    """Vector type of an operation on a vector and a vector or number; None for others."""
     if isinstance(a, VectorType):
         return a if a == b or isinstance(b, types.Number) else None
     return b if isinstance(b, VectorType) and isinstance(a, types.Number) else None
 
 
 def _define_operator(function: Callable[..., Any], instruction: str) -> None:
-    """Let numba's own operator take vectors; an `overload` would compile a function for each pair of types."""
+    """Extend numba's own operator to vectors; an `overload` would compile a function for each pair of types."""
 
     @infer_global(function)  # pyright: ignore[reportOptionalCall]
     class _VectorOperator(AbstractTemplate):
@@ -136,7 +136,7 @@ for _function, _instruction in (
 
 @intrinsic
 def root(_typing: Any, value: Any) -> Any:
-    """Square root of a number or of every number of a vector, correctly rounded."""
+    """Square root of a number or of each number of a vector, correctly rounded."""
     vector = isinstance(value, VectorType)
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
@@ -150,7 +150,7 @@ def root(_typing: Any, value: Any) -> Any:
 
 @intrinsic
 def keep_lower(_typing: Any, new: Any, old: Any, of_new: Any, of_old: Any) -> Any:
-    """Entry by entry `of_old` where old <= new, else `of_new`: a new value that is not a number is taken."""
+    """Entry by entry `of_old` for old <= new, else `of_new`, so also for a new value of nan."""
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">=", values[0], values[1]), values[3], values[2])
@@ -171,7 +171,7 @@ def below_zero(_typing: Any, value: Any) -> Any:
 
 @intrinsic
 def any_below(_typing: Any, value: Any, limit: Any) -> Any:
-    """Whether a number, or any number of a vector, is below a limit."""
+    """True if a number, or any number of a vector, is below a limit."""
 
     def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         if not isinstance(value, VectorType):
@@ -192,7 +192,7 @@ def _pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, index: 
 
 
 def _define_load(width_of: Callable[[Any], int], scale: Callable[[int], int]) -> Any:
-    """A load of `width_of` numbers from place index * scale of an array seen as flat."""
+    """Load of `width_of` numbers from place index * scale of a flat array."""
 
     @intrinsic
     def load(_typing: Any, array: Any, index: Any) -> Any:
@@ -201,7 +201,7 @@ def _define_load(width_of: Callable[[Any], int], scale: Callable[[int], int]) ->
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
             place = builder.mul(values[1], ir.Constant(values[1].type, scale(vector.width)))
             loaded = builder.load(_pointer(context, builder, signature.args[0], values[0], place, vector))
-            # What the numbers need, not what the register would like: saved states come back wherever numpy puts them.
+            # The alignment of the numbers: arrays of saved states have no larger one.
             loaded.align = array.dtype.bitwidth // 8
             return loaded
 
@@ -228,16 +228,16 @@ def _define_store(scale: Callable[[int], int]) -> Any:
 # A vector of a group from place `index` of an array; the four numbers of row `index` of an array (n, 4).
 load_group = _define_load(lambda _: GROUP, lambda _: 1)
 load_row = _define_load(lambda _: 4, lambda _: 4)
-# The `index`-th vector of an array that is made of them.
+# The `index`-th vector of an array of vectors.
 store_lanes = _define_store(lambda width: width)
 store_row = _define_store(lambda _: 4)
-# What `load_group` reads.
+# Store for `load_group`.
 store_group = _define_store(lambda _: 1)
 
 
 @intrinsic
 def load_lanes(_typing: Any, lanes: Any, array: Any, index: Any) -> Any:
-    """The `index`-th vector of an array that is made of them, as wide as the tuple `lanes` is long."""
+    """The `index`-th vector of an array of vectors as wide as the length of the tuple `lanes`."""
     vector = VectorType(array.dtype, len(lanes))
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, values: Any) -> Any:
@@ -251,7 +251,7 @@ def load_lanes(_typing: Any, lanes: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def spread_group(_typing: Any, value: Any) -> Any:
-    """A number for every item of a group."""
+    """Vector of a group with the same number for each item."""
     vector = VectorType(value, GROUP)
 
     def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
@@ -262,7 +262,7 @@ def spread_group(_typing: Any, value: Any) -> Any:
 
 @intrinsic
 def load_or_spread(_typing: Any, lanes: Any, like: Any, array: Any, index: Any) -> Any:
-    """What each lane has of its own in an array (n, n_lane), or what an array (n,) has for all, of type `like`."""
+    """Vector of each lane's own numbers in an array (n, n_lane), or of a common number in an array (n,); as `like`."""
     own = array.ndim == 2
     vector = VectorType(array.dtype if own else like.dtype, len(lanes))
 
@@ -283,7 +283,7 @@ def load_or_spread(_typing: Any, lanes: Any, like: Any, array: Any, index: Any) 
 
 
 def define_shuffle(places: list[int]) -> Any:
-    """A function of two vectors that picks entries of both, one after the other, by place."""
+    """Function that selects entries of two joined vectors by place."""
 
     @intrinsic
     def shuffle(_typing: Any, a: Any, b: Any) -> Any:
@@ -297,7 +297,7 @@ def define_shuffle(places: list[int]) -> Any:
 
 
 def define_extract(place: int) -> Any:
-    """A function that takes one number out of a vector."""
+    """Function that extracts the number at a place of a vector."""
 
     @intrinsic
     def extract(_typing: Any, a: Any) -> Any:
@@ -311,13 +311,13 @@ def define_extract(place: int) -> Any:
 
 @intrinsic
 def fold_lower(_typing: Any, vector: Any, lowest: Any) -> Any:
-    """`keep_lower` of a number and of the numbers of a vector, one after the other."""
+    """`keep_lower` of a number and the numbers of a vector, in order."""
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
         least = values[1]
         for place in range(vector.width):
-            one = builder.extract_element(values[0], ir.Constant(ir.IntType(32), place))
-            least = builder.select(builder.fcmp_ordered(">=", one, least), least, one)
+            number = builder.extract_element(values[0], ir.Constant(ir.IntType(32), place))
+            least = builder.select(builder.fcmp_ordered(">=", number, least), least, number)
         return least
 
     return vector.element(vector, vector.element), generate

@@ -1,32 +1,31 @@
-"""Springs fitted to the mesh: factors on formula (6) that bring the network's node forces near those of the solid.
+"""Springs fitted to the mesh: factors on formula (6) for node forces of the network near those of the solid.
 
-Formula (6) gives every tet's edges a share that knows only the tet's volume; on the surface, where a node has half its
-tets, the network is then too stiff (clamped torsion of the paper's prism: +58 %). Here each spring gets a factor s_e:
+Formula (6) gives the edges of a tet a share of its volume alone; the network is then too stiff on the surface, at nodes
+with half their tets (clamped torsion of the paper's prism: +58 %). Here each spring gets a factor s_e:
 
     minimise  sum over strains m and nodes i of |w_i (f_mi(s) - F_mi)|^2  +  sum over springs of p_e (s_e - 1)^2
     with      s_e >= 0.05,
 
-f_mi the force that the springs s_e k_e, k_e of formula (6), put on node i in the affine strain m, F_mi the force of
+with f_mi the force of the springs s_e k_e, k_e of formula (6), on node i in the affine strain m, and F_mi the force of
 linear tets (finite elements of first order, nu = 1/4, lambda = mu = 2 E / 5) in the same field, both with the mesh's
-moduli; w_i = V_i^(-2/3) / E_i, of the mean volume and modulus of the tets around a node, makes coarse and fine, soft
-and hard parts count alike. The six strains are an orthonormal basis (|eps| = 1), so the sum does not change when the
-mesh is turned.
+moduli. The weights w_i = V_i^(-2/3) / E_i, of the mean volume and modulus of the tets around a node, balance coarse and
+fine, soft and hard parts. The six strains are an orthonormal basis (|eps| = 1), so the sum is invariant to rotation.
 
-On the surface, averages over neighbouring nodes are compared instead of single nodes, whose differences count
-0.003: linear tets give a node with eight triangles twice the traction of one with four, and springs made to follow that
-vary as much (single surface nodes of a block then differ by 43 % in stiffness; 8 % with averages and with formula (6)).
+On the surface, averages over neighbouring nodes are compared, and differences of single nodes count 0.003: linear tets
+give a node with eight triangles twice the traction of a node with four, and springs fitted to that would vary as much
+(stiffness of single surface nodes of a block +-43 %; 8 % with averages and with formula (6)).
 
-In the affine strain every straight line of springs through a lattice has one tension, so a change at the surface
-continues along the line through the body. Inside, formula (6) is right already: the pull p_e towards it is weak near
-the surface and triples with every layer of nodes from the third on, which brings the factors back to 1 over some five
-cells and changes the residual little.
+In the affine strain a straight line of springs through a lattice has one tension, so a change at the surface continues
+along the line through the body. Inside, formula (6) is right already: the pull p_e towards it is weak near the surface
+and triples with each layer of nodes from the third on, so that the factors return to 1 over some five cells, with
+little change of the residual.
 
-No published source is known for this fit; `FitReport` says how well it represents a mesh.
+No published source is known for this fit; `FitReport` has its quality.
 
 The factors are those of the homogeneous organ: lesions change the formula's k_e, not s_e, so lesions may differ from
 reset to reset. With an 8x lesion the stiffness of a whole block is within 0.6 % of that of a fit with the lesion in it;
-a disc of 1.5 cells pressed onto the lesion within 1.5 %, single nodes above it within 14 %. The factors stay with the
-mesh object for as long as it lives.
+a disc of 1.5 cells pressed onto the lesion within 1.5 %, single nodes above it within 14 %. The factors live as long as
+the mesh object.
 """
 
 import math
@@ -41,12 +40,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from msdm_core.arithmetic import cbrt, dot, log, matmul, norm, power
 from msdm_core.errors import OrganError
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, area_vectors
 
-# No spring is fitted softer than this share of formula (6): a spring near 0 would leave its nodes loose.
+# Lower bound of the factors on formula (6): a spring near 0 would leave its nodes loose.
 SMALLEST_FACTOR = 0.05
-# p_e at the surface, over the mean diagonal of the normal equations, and how it grows with the layer of nodes, counted
-# in springs from the surface.
+# p_e at the surface, over the mean diagonal of the normal equations, and its growth per layer of nodes, counted in
+# springs from the surface.
 PULL_TO_LLOYD = 2e-3
 PULL_GROWTH = 3.0
 WEAK_LAYERS = 2
@@ -59,9 +58,9 @@ SINGLE_NODE_SHARE = 3e-3
 # do not (a 10 mm sphere, residual 0.11, comes out softer, 0.70 of the solid in shear, not 0.79): use "lloyd" there.
 # Jittered Delaunay and 6-tet cubes leave 0.24 to 0.5, and torsion falls to 0.66 and less.
 LARGEST_RESIDUAL = 0.18
-# Largest imbalance |sum of k l n n n| over sum of k l of formula (6)'s springs n around a node whose neighbours all lie
-# inside. Lattices of one cell size have none. Where there is some, formula (6) is wrong inside too, and a fit leaves
-# nodes loose: at the seams of graded lattices (0.19), E across them fell by 7 to 34 %.
+# Largest imbalance |sum of k l n n n| over sum of k l of formula (6)'s springs n around a node surrounded by inner
+# nodes. Lattices of one cell size have none. With an imbalance formula (6) is wrong inside too, and a fit leaves nodes
+# loose: at the seams of graded lattices (0.19), E across them fell by 7 to 34 %.
 LARGEST_IMBALANCE = 0.05
 
 _H = math.sqrt(0.5)
@@ -81,13 +80,13 @@ UNIT_STRAINS = np.array(
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well springs could be fitted to a mesh.
+    """Quality of a fit of springs to a mesh.
 
     Fields:
-        residual_before: |f - F| / |F| of formula (6), of the node forces as they are compared, six unit strains.
-        residual_after: the same of the fitted springs (of the attempt, where the fallback was used).
-        fallback: whether the springs are formula (6) times one scalar per region, because the residual stayed large or
-            the mesh is uneven inside.
+        residual_before: |f - F| / |F| of formula (6), of the compared node forces, six unit strains.
+        residual_after: the same of the fitted springs (of the attempt, with the fallback).
+        fallback: True for formula (6) times one scalar per region, because the residual stayed large or the mesh is
+            uneven inside.
         factor_smallest: smallest factor on formula (6).
         factor_largest: largest factor on formula (6).
     """
@@ -119,10 +118,10 @@ _FITS: WeakKeyDictionary[TetMesh, SpringFit] = WeakKeyDictionary()
 
 
 def spring_fit(mesh: TetMesh) -> SpringFit:
-    """The fit of a mesh's homogeneous organ, made on first use and kept for as long as the mesh lives.
+    """Fit of a mesh's homogeneous organ, made on first use and kept as long as the mesh lives.
 
     Warns:
-        UserWarning: the network cannot represent the solid on this mesh; names the residual and the scalars used.
+        UserWarning: the network cannot represent the solid on this mesh; names the residual and the scalars in use.
     """
     fit = _FITS.get(mesh)
     if fit is None:
@@ -131,11 +130,11 @@ def spring_fit(mesh: TetMesh) -> SpringFit:
 
 
 def fit_springs(mesh: TetMesh, youngs_modulus: ArrayLike = 1.0) -> SpringFit:
-    """Fit factors to formula (6), or fall back to one scalar per region; the result is not remembered.
+    """Fit factors to formula (6), or fall back to one scalar per region; not cached.
 
     Args:
         mesh: the organ's tets.
-        youngs_modulus: E, only its distribution matters: a scalar or one value a tet, shape (n_tet,).
+        youngs_modulus: E, only its distribution matters: a scalar or a value per tet, shape (n_tet,).
 
     Warns:
         UserWarning: the fallback is used; names the residual and the scalars.
@@ -165,7 +164,7 @@ def fit_springs(mesh: TetMesh, youngs_modulus: ArrayLike = 1.0) -> SpringFit:
 
 
 def _fit_factors(matrix: csr_array, target: FloatArray, pull: FloatArray) -> FloatArray:
-    """The factors of the springs: the normal equations of |A s - b|^2 + sum p_e (s_e - 1)^2, with s_e bounded below."""
+    """Factors of the springs, from the normal equations of |A s - b|^2 + sum p_e (s_e - 1)^2, s_e bounded below."""
     normal = csr_array(matrix.T @ matrix)
     weight = pull * float(normal.diagonal().mean())
     normal = csr_array(normal + diags_array(weight))
@@ -182,12 +181,12 @@ def _pull_to_lloyd(mesh: TetMesh) -> FloatArray:
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(mesh.node_count,) * 2).tocsr()
     layer = dijkstra(graph, directed=False, indices=mesh.boundary_nodes, unweighted=True, min_only=True)
     beyond = np.maximum(layer[edges].min(axis=1) + 1 - WEAK_LAYERS, 0.0)
-    doublings = np.minimum(beyond, log(LARGEST_PULL / PULL_TO_LLOYD) / log(PULL_GROWTH))
-    return PULL_TO_LLOYD * power(PULL_GROWTH, doublings)
+    exponent = np.minimum(beyond, log(LARGEST_PULL / PULL_TO_LLOYD) / log(PULL_GROWTH))
+    return PULL_TO_LLOYD * power(PULL_GROWTH, exponent)
 
 
 def _inner_imbalance(mesh: TetMesh) -> float:
-    """Largest |sum of k l n n n| / sum of k l of formula (6)'s springs around nodes whose neighbours all lie inside."""
+    """Largest |sum of k l n n n| / sum of k l of formula (6)'s springs around nodes surrounded by inner nodes."""
     inside = np.ones(mesh.node_count, dtype=bool)
     inside[mesh.tets[np.isin(mesh.tets, mesh.boundary_nodes).any(axis=1)]] = False
     ends = mesh.edges.astype(np.int64)
@@ -198,7 +197,7 @@ def _inner_imbalance(mesh: TetMesh) -> float:
     tension = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(ends)) * length
     cubes = along[:, :, None, None] * along[:, None, :, None] * along[:, None, None, :]
     moment = (cubes * tension[:, None, None, None]).reshape(-1, 27)
-    # Seen from its two ends a spring points in opposite directions.
+    # A spring has opposite directions at its two ends.
     signs = csr_array((np.tile([1.0, -1.0], len(ends)), (ends.ravel(), np.repeat(np.arange(len(ends)), 2))))
     imbalance = norm(signs @ moment, axis=1) / (abs(signs) @ tension)
     return float(imbalance[inside].max(initial=0.0))
@@ -206,14 +205,14 @@ def _inner_imbalance(mesh: TetMesh) -> float:
 
 def _warn_of_fallback(residual: float, tet_factor: FloatArray) -> None:
     scalars = ", ".join(f"{scalar:.3f}" for scalar in np.unique(tet_factor))
-    why = (
+    reason = (
         f"springs fitted to this mesh leave a residual of {residual:.2f} of the solid's node forces, more than "
         f"{LARGEST_RESIDUAL:g}"
         if residual > LARGEST_RESIDUAL
         else "this mesh has cells of several sizes inside, and springs fitted to it leave nodes loose where they meet"
     )
     warnings.warn(
-        f"{why}: the network cannot represent the solid there. Formula (6) times one scalar per region "
+        f"{reason}: the network cannot represent the solid there. Formula (6) times one scalar per region "
         f"({scalars}) is used instead; blocks of cubic cells (box_mesh) can be fitted",
         UserWarning,
         stacklevel=4,
@@ -221,15 +220,15 @@ def _warn_of_fallback(residual: float, tet_factor: FloatArray) -> None:
 
 
 def _region_scalars(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> FloatArray:
-    """The scalar of each tet's region that makes its affine stiffness right in the mean, shape (n_tet,).
+    """Scalar of each tet's region for the right mean affine stiffness, shape (n_tet,).
 
     C_iijj = (1 / V) sum k l^2 = 6 E for lambda = mu = 2 E / 5, so the scalar is 6 sum E_t V_t / sum k_et l_e^2.
     """
     spans = mesh.points[mesh.edges[:, 1]] - mesh.points[mesh.edges[:, 0]]
     squares = dot(spans, spans)[mesh.tet_edges].sum(axis=1)
     tags, region = np.unique(mesh.region, return_inverse=True)
-    wanted = 6.0 * np.bincount(region, modulus * mesh.volumes, len(tags))
-    return (wanted / np.bincount(region, share * squares, len(tags)))[region]
+    solid = 6.0 * np.bincount(region, modulus * mesh.volumes, len(tags))
+    return (solid / np.bincount(region, share * squares, len(tags)))[region]
 
 
 # ---- node forces of the six unit strains ------------------------------------------------------------------------
@@ -238,8 +237,8 @@ def _region_scalars(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> Fl
 def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> tuple[csr_array, FloatArray]:
     """Weighted node forces of the springs per factor, (18 n_node, n_spring), and of the solid, (18 n_node,).
 
-    Row 18 i + 3 m + a is component a of node i's force in strain m. A spring with span d puts k (d . eps d) / |d|^2 d
-    on its second node's pull, and minus that on the first.
+    Row 18 i + 3 m + a is component a of node i's force in strain m. A spring with span d adds k (d . eps d) / |d|^2 d
+    to the force of its second node, and minus that to the first.
     """
     edges, node_count = mesh.edges.astype(np.int64), mesh.node_count
     stiffness = np.bincount(mesh.tet_edges.ravel(), np.repeat(share, 6), len(edges))
@@ -258,14 +257,13 @@ def _force_equations(mesh: TetMesh, share: FloatArray, modulus: FloatArray) -> t
 
 
 def _surface_averages(mesh: TetMesh) -> csr_array:
-    """From node forces to those that are compared: averages on the surface, then single nodes, (36 n, 18 n).
+    """Map from node forces to the compared forces: averages on the surface, then single nodes, (36 n, 18 n).
 
-    A surface node's force is shared among its triangles by area, and each triangle gives a third to each corner.
-    Eight triangles around one node and four around the next, as outer faces are cut, then make no difference.
+    A surface node's force is divided among its triangles by area, and each triangle gives a third to each corner, so
+    that nodes with eight and with four triangles, alternating on outer faces, compare alike.
     """
     triangles, node_count = mesh.boundary_triangles, mesh.node_count
-    corners = mesh.points[triangles]
-    area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = norm(area_vectors(mesh.points[triangles]), axis=1)
     around = np.bincount(triangles.ravel(), np.repeat(area, 3), node_count)
     owner = np.repeat(np.arange(len(triangles)), 3)
     places, shape = (owner, triangles.ravel()), (len(triangles), node_count)
@@ -294,8 +292,7 @@ def _solid_forces(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
     """
     trace = np.trace(UNIT_STRAINS, axis1=1, axis2=2)
     stress = 0.4 * (trace[:, None, None] * np.eye(3) + 2.0 * UNIT_STRAINS)
-    faces = mesh.points[mesh.tets[:, TET_FACES]]
-    area = 0.5 * np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0])
+    area = area_vectors(mesh.points[mesh.tets[:, TET_FACES]])
     force = matmul(area * (modulus / -3.0)[:, None, None], stress.reshape(18, 3).T).reshape(-1, 18)
     corners = mesh.tets.ravel()
     columns = [np.bincount(corners, column, mesh.node_count) for column in force.T]
@@ -303,7 +300,7 @@ def _solid_forces(mesh: TetMesh, modulus: FloatArray) -> FloatArray:
 
 
 def lloyd_share(mesh: TetMesh, youngs_modulus: FloatArray) -> FloatArray:
-    """Stiffness that a tet gives to each of its edges, (2 sqrt 2 / 25) l_t E_t [N/m], shape (n_tet,).
+    """Share of stiffness from a tet for each of its edges, (2 sqrt 2 / 25) l_t E_t [N/m], shape (n_tet,).
 
     l_t = (12 V_t / sqrt 2)^(1/3) is the edge of the regular tet of the same volume; E_t [Pa], shape (n_tet,).
     """
@@ -316,54 +313,54 @@ TOLERANCE = 1e-6
 
 
 def minimise_bounded(matrix: csr_array, right: FloatArray, start: FloatArray, lower: float) -> FloatArray:
-    """The x >= lower that minimises x . H x / 2 - c . x, for a symmetric positive definite H, shape (n,).
+    """Minimum over x >= lower of x . H x / 2 - c . x, for a symmetric positive definite H, shape (n,).
 
-    Unknowns at the bound that the gradient holds there are set aside; the rest take the Newton step, found by
-    conjugate gradients, bent at the bound and halved until the sum falls enough (Bertsekas 1982). It ends where no
-    free unknown would move by more than TOLERANCE on its own, |g_i| / H_ii.
+    Projected Newton (Bertsekas 1982): unknowns held at the bound by the gradient are set aside; the free ones take the
+    Newton step, by conjugate gradients, projected onto the bound and halved until the sum falls enough. The end is
+    |g_i| / H_ii <= TOLERANCE of all free unknowns.
 
     Args:
         matrix: H, (n, n).
         right: c, (n,).
-        start: where to begin, at least `lower`, (n,).
+        start: at least `lower`, (n,).
         lower: the bound.
 
     Raises:
-        OrganError: it does not converge; names what is left.
+        OrganError: no convergence; names the largest remaining step.
     """
-    diagonal, found = np.asarray(matrix.diagonal(), dtype=np.float64), start
-    left = np.inf
+    diagonal, x = np.asarray(matrix.diagonal(), dtype=np.float64), start
+    remaining = np.inf
     for turn in range(ROUNDS):
-        gradient = matrix @ found - right
-        free = np.flatnonzero((found > lower) | (gradient < 0.0))
-        left = float(np.abs(gradient[free] / diagonal[free]).max(initial=0.0))
-        if left <= TOLERANCE:
-            return found
+        gradient = matrix @ x - right
+        free = np.flatnonzero((x > lower) | (gradient < 0.0))
+        remaining = float(np.abs(gradient[free] / diagonal[free]).max(initial=0.0))
+        if remaining <= TOLERANCE:
+            return x
         accuracy = 1e-3 if turn < 3 else 1e-6
-        step = np.zeros_like(found)
+        step = np.zeros_like(x)
         step[free] = _conjugate_gradients(matrix[free][:, free], -gradient[free], diagonal[free], accuracy)
-        found = _descend(matrix, found, gradient, step, lower)
+        x = _descend(matrix, x, gradient, step, lower)
     raise OrganError(
-        f"fitting springs to this mesh did not converge in {ROUNDS} rounds (largest step left {left:.2g}, the rule is "
-        f'at most {TOLERANCE:g}): use stiffness_rule="lloyd", or remesh'
+        f"fitting springs to this mesh did not converge in {ROUNDS} rounds (largest remaining step {remaining:.2g}, "
+        f'the rule is at most {TOLERANCE:g}): use stiffness_rule="lloyd", or remesh'
     )
 
 
-def _descend(matrix: csr_array, found: FloatArray, gradient: FloatArray, step: FloatArray, lower: float) -> FloatArray:
-    """Go along a step bent at the bound; the sum changes by g . d + d . H d / 2 for a change d."""
+def _descend(matrix: csr_array, x: FloatArray, gradient: FloatArray, step: FloatArray, lower: float) -> FloatArray:
+    """Line search along a projected step; a change d changes the sum by g . d + d . H d / 2."""
     length = 1.0
     for _ in range(40):
-        moved = np.maximum(found + length * step, lower)
-        change = moved - found
+        moved = np.maximum(x + length * step, lower)
+        change = moved - x
         slope = dot(gradient, change)
         if slope + 0.5 * dot(change, matrix @ change) <= 1e-4 * slope:
             return moved
         length *= 0.5
-    return found
+    return x
 
 
 def _conjugate_gradients(matrix: csr_array, right: FloatArray, diagonal: FloatArray, accuracy: float) -> FloatArray:
-    """Solve M x = b for a symmetric positive M with Jacobi's preconditioner, to a relative accuracy."""
+    """Solution of M x = b for a symmetric positive M, with Jacobi's preconditioner, to a relative accuracy."""
     solution, residual = np.zeros_like(right), right.copy()
     scaled = residual / diagonal
     direction = scaled.copy()
@@ -371,10 +368,10 @@ def _conjugate_gradients(matrix: csr_array, right: FloatArray, diagonal: FloatAr
     for _ in range(1000):
         if energy <= accuracy * accuracy * start:
             break
-        pushed = matrix @ direction
-        length = energy / dot(direction, pushed)
+        image = matrix @ direction
+        length = energy / dot(direction, image)
         solution += length * direction
-        residual -= length * pushed
+        residual -= length * image
         scaled = residual / diagonal
         energy, before = dot(residual, scaled), energy
         direction = scaled + (energy / before) * direction

@@ -1,4 +1,4 @@
-"""Mass lumping: the mass of each node from the density and the share of each tet that belongs to a corner."""
+"""Mass lumping: node masses from the density and each corner's share of a tet."""
 
 from typing import Literal, get_args
 
@@ -10,7 +10,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
 
 MassScheme = Literal["barycentric", "voronoi"]
 
-# Tets clipped at a time: keeps the pieces of one batch (up to nine per corner) within some tens of megabytes.
+# Tets in a batch: its pieces (up to nine per corner) take some tens of megabytes.
 _BATCH = 8192
 
 
@@ -21,7 +21,7 @@ def lump_mass(mesh: TetMesh, density: ArrayLike, *, scheme: MassScheme) -> Float
     "voronoi" the part of the tet nearest to it, m_i = sum_t rho_t V(C(i, t)) (Sala et al. 2011, eq. 3 to 5).
 
     Raises:
-        OrganError: names the unknown scheme and the known ones.
+        OrganError: an unknown scheme; lists the known.
     """
     if scheme not in get_args(MassScheme):
         raise OrganError(f"mass scheme {scheme!r} is unknown; known: {', '.join(get_args(MassScheme))}")
@@ -30,13 +30,11 @@ def lump_mass(mesh: TetMesh, density: ArrayLike, *, scheme: MassScheme) -> Float
         shares = np.full((mesh.tet_count, 4), 0.25)
     else:
         shares = voronoi_fractions(mesh.points, mesh.tets)
-    corner_mass = shares * tet_mass[:, None]
-    mass = np.bincount(mesh.tets.ravel(), weights=corner_mass.ravel(), minlength=mesh.node_count)
-    return np.asarray(mass, dtype=np.float64)
+    return np.bincount(mesh.tets.ravel(), (shares * tet_mass[:, None]).ravel(), mesh.node_count).astype(np.float64)
 
 
 def voronoi_fractions(points: ArrayLike, tets: ArrayLike) -> FloatArray:
-    """Share of each tet's volume that is nearest to each of its corners, shape (n_tet, 4), rows summing to 1.
+    """Share of each tet's volume nearest to each of its corners, shape (n_tet, 4), rows of sum 1.
 
     V(C(i, t)) / V(t), C(i, t) = {q in t: |q - p_i| < |q - p_j| for all j != i} (Sala et al. 2011, eq. 3 and 4),
     by exact clipping, so the circumcentre may lie outside. `points` [m], shape (n_node, 3); `tets` (n_tet, 4).
@@ -47,7 +45,7 @@ def voronoi_fractions(points: ArrayLike, tets: ArrayLike) -> FloatArray:
 
 
 def _batch_fractions(corners: FloatArray) -> FloatArray:
-    """Voronoi shares of tets given by their corners [m], shape (n_tet, 4, 3)."""
+    """Voronoi shares of tets with corners (n_tet, 4, 3) [m], shape (n_tet, 4)."""
     tet_count = len(corners)
     squared = np.sum(np.square(corners[:, :, None] - corners[:, None]), axis=3)
     shares = np.empty((tet_count, 4))
@@ -64,7 +62,7 @@ def _batch_fractions(corners: FloatArray) -> FloatArray:
 
 
 def _clipped(owner: NDArray, volume: FloatArray, values: FloatArray) -> tuple[NDArray, FloatArray, FloatArray]:
-    """The part of each piece where its first linear function is positive, as pieces that keep the other functions.
+    """Part of each piece with a positive first linear function, as pieces with the other functions.
 
     A piece is a tet: owner (n,), volume (n,) as a share of the owner, values of k functions at its corners (n, 4, k).
     """
@@ -73,34 +71,34 @@ def _clipped(owner: NDArray, volume: FloatArray, values: FloatArray) -> tuple[ND
     positive = np.count_nonzero(values[:, :, 0] > 0, axis=1)
     kept = positive == 4
     pieces = [(owner[kept], volume[kept], values[kept, :, 1:])]
-    for inside, split in ((1, _split_one), (2, _split_two), (3, _split_three)):
+    for inside, split in ((1, _tip), (2, _wedge), (3, _frustum)):
         chosen = np.flatnonzero(positive == inside)
         if chosen.size:
             pieces += [
                 (owner[chosen], volume[chosen] * share, corner_values[:, :, 1:])
                 for share, corner_values in split(values[chosen])
             ]
-    owners, volumes, rest = zip(*pieces, strict=True)
-    return np.concatenate(owners), np.concatenate(volumes), np.concatenate(rest)
+    owners, volumes, functions = map(np.concatenate, zip(*pieces, strict=True))
+    return owners, volumes, functions
 
 
 Split = list[tuple[FloatArray, FloatArray]]
 
 
 def _cut(values: FloatArray, inner: int, outer: int) -> tuple[FloatArray, FloatArray]:
-    """Where the first function is zero on an edge: its share of the way out (n,), and all values there (n, k)."""
+    """Zero of the first function on an edge: its fraction from the inner corner (n,), and all values there (n, k)."""
     a, b = values[:, inner], values[:, outer]
-    way = a[:, 0] / (a[:, 0] - b[:, 0])
-    return way, a + way[:, None] * (b - a)
+    fraction = a[:, 0] / (a[:, 0] - b[:, 0])
+    return fraction, a + fraction[:, None] * (b - a)
 
 
-def _split_one(values: FloatArray) -> Split:
-    """Corner 0 is inside: one small tet at that corner."""
+def _tip(values: FloatArray) -> Split:
+    """Corner 0 is inside: a small tet at that corner."""
     (s, on_1), (t, on_2), (u, on_3) = (_cut(values, 0, outer) for outer in (1, 2, 3))
     return [(s * t * u, np.stack([values[:, 0], on_1, on_2, on_3], axis=1))]
 
 
-def _split_two(values: FloatArray) -> Split:
+def _wedge(values: FloatArray) -> Split:
     """Corners a, b = 0, 1 are inside: a prism with ends (a, ac, ad) and (b, bc, bd), cut into three tets."""
     a, b = values[:, 0], values[:, 1]
     (s, ac), (t, ad) = _cut(values, 0, 2), _cut(values, 0, 3)
@@ -112,7 +110,7 @@ def _split_two(values: FloatArray) -> Split:
     ]
 
 
-def _split_three(values: FloatArray) -> Split:
+def _frustum(values: FloatArray) -> Split:
     """Corners a, b, c = 0, 1, 2 are inside: a prism with ends (a, b, c) and (ad, bd, cd), cut into three tets."""
     a, b, c = values[:, 0], values[:, 1], values[:, 2]
     (s, ad), (t, bd), (u, cd) = (_cut(values, inner, 3) for inner in (0, 1, 2))

@@ -1,7 +1,7 @@
-"""Materials of an organ's regions: parenchyma, capsule, lesions and damping, and what follows for each tet.
+"""Materials of an organ's regions (parenchyma, capsule, lesions), damping, and the moduli of each tet.
 
-A lesion fills a share of each tet, which mixes its moduli; a Poisson's ratio above that of springs gives the tet a
-volume term, of which a part is averaged at nodes.
+A tet partly inside a lesion has mixed moduli; a Poisson's ratio above that of springs adds a volume term, of which a
+part is averaged at nodes.
 """
 
 import math
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import dot, expm1, log1p, matmul, norm, power
-from msdm_core.errors import OrganError
+from msdm_core.errors import OrganError, require_positive
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import TET_EDGES, FloatArray, TetMesh
 
-# At least this share of a lesion must lie inside the organ.
+# Smallest share of a lesion inside the organ.
 LESION_SHARE_INSIDE = 0.5
 
 # Largest rate [1/s] and time [s] of damping: beyond any tissue, and no stable step rounds to 0.
@@ -24,7 +24,7 @@ DAMPING_MOST = 1e6
 # Smallest and largest radius of a lesion [m]: beyond any organ, and quotients do not overflow.
 SMALLEST, FARTHEST = 1e-6, 1e6
 
-# Points per tet edge of the barycentric lattice that samples a tet cut by a lesion's surface: 165 points.
+# Points per edge of the barycentric lattice in a sampled tet: 165 points.
 SAMPLES_PER_EDGE = 9
 
 
@@ -36,8 +36,8 @@ class Material:
         youngs_modulus: E at rest and in equilibrium [Pa], above 0.
         density: [kg/m^3], above 0.
         poisson_ratio: nu, at least 1/4 (springs alone give 1/4; the volume term adds to it) and below 1/2.
-        stiffening: how its springs stiffen with strain, or None.
-        relaxation: how their tension relaxes, or None.
+        stiffening: of its springs with strain, or None.
+        relaxation: of their tension with time, or None.
 
     Raises:
         OrganError: names the field, its value and its range.
@@ -50,11 +50,8 @@ class Material:
     relaxation: Relaxation | None = None
 
     def __post_init__(self) -> None:
-        for name in ("youngs_modulus", "density"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                unit = "Pa" if name == "youngs_modulus" else "kg/m^3"
-                raise OrganError(f"{name} is {value} {unit}; it must be finite and above 0")
+        require_positive("youngs_modulus", self.youngs_modulus, "Pa")
+        require_positive("density", self.density, "kg/m^3")
         if not 0.25 <= self.poisson_ratio < 0.5:
             raise OrganError(
                 f"poisson_ratio is {self.poisson_ratio}; a spring network with a volume term reaches 0.25 <= nu < 0.5: "
@@ -63,7 +60,7 @@ class Material:
 
     @property
     def spring_modulus(self) -> float:
-        """Modulus given to formula (6) so that the shear modulus is E / (2 (1 + nu)): E_s = E (1.25 / (1 + nu)) [Pa].
+        """Modulus in formula (6) for the shear modulus E / (2 (1 + nu)): E_s = E (1.25 / (1 + nu)) [Pa].
 
         Springs alone have lambda = mu = (2/5) E_s. At nu = 1/4 this is E to the bit.
         """
@@ -83,8 +80,8 @@ class Damping:
     A mode of angular frequency w decays with the ratio alpha / (2 w) + beta w / 2.
 
     Args:
-        alpha: mass-proportional rate [1/s], at least 0; it drags against the fixed world.
-        beta: stiffness-proportional time [s], at least 0; it acts along each spring and on each tet's volume.
+        alpha: mass-proportional rate [1/s], at least 0; drag against the fixed world.
+        beta: stiffness-proportional time [s], at least 0; along each spring and on each tet's volume.
     """
 
     alpha: float
@@ -101,11 +98,10 @@ class Damping:
 
 @dataclass(frozen=True)
 class Capsule:
-    """The organ's outer layer (stroma), found from the boundary.
+    """Outer layer of an organ (stroma).
 
-    With a thickness it is a membrane of stiffness E_c h_c on any mesh: for a capsule of known modulus and thickness.
-    Without one it is the paper's rule, to repeat the paper or for stroma about that thick: the tets with a face
-    on the boundary take this modulus, a layer of a sixth of a cell, whose membrane stiffness of 0.29 cell (E_c - E)
+    With a thickness, a membrane of stiffness E_c h_c on any mesh. Without, the paper's rule: the tets with a face on
+    the boundary have this modulus, a layer of a sixth of a cell, with a membrane stiffness of 0.29 cell (E_c - E) that
     grows with the cell. A layer thicker than a cell is a region of the mesh.
 
     Args:
@@ -117,12 +113,9 @@ class Capsule:
     thickness: float | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.youngs_modulus) and self.youngs_modulus > 0.0):
-            raise OrganError(f"capsule: youngs_modulus is {self.youngs_modulus} Pa; it must be finite and above 0")
-        if self.thickness is not None and not (math.isfinite(self.thickness) and self.thickness > 0.0):
-            raise OrganError(
-                f"capsule: thickness is {self.thickness} m; it must be above 0, or None for the paper's layer of tets"
-            )
+        require_positive("capsule: youngs_modulus", self.youngs_modulus, "Pa")
+        if self.thickness is not None:
+            require_positive("capsule: thickness", self.thickness, "m")
 
 
 @dataclass(frozen=True)
@@ -132,8 +125,8 @@ class Lesion:
     Args:
         centre: (x, y, z) [m].
         radius: of a sphere [m].
-        material: what the lesion is made of.
-        name: how messages and reports call it.
+        material: of the lesion.
+        name: in messages and reports.
         radii: half axes along x, y, z of an ellipsoid [m], instead of radius.
         region: name of a mesh region, instead of centre and radius.
     """
@@ -152,11 +145,8 @@ class Lesion:
             raise OrganError(f"{self.name}: give a centre and either radius or radii, or a mesh region")
         axes = self.half_axes
         if not ((axes >= SMALLEST) & (axes <= FARTHEST)).all():
-            raise OrganError(f"{self.name}: {self._size_text}; it must be from {SMALLEST:g} to {FARTHEST:g}")
-
-    @property
-    def _size_text(self) -> str:
-        return f"radius is {self.radius} m" if self.radii is None else f"radii are {self.radii} m"
+            size = f"radius is {self.radius} m" if self.radii is None else f"radii are {self.radii} m"
+            raise OrganError(f"{self.name}: {size}; the rule is {SMALLEST:g} to {FARTHEST:g} m")
 
     @property
     def half_axes(self) -> FloatArray:
@@ -165,13 +155,13 @@ class Lesion:
 
 
 def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
-    """Share of each tet's volume that a lesion fills, in [0, 1], shape (n_tet,).
+    """Share of each tet's volume inside a lesion, in [0, 1], shape (n_tet,).
 
-    Tets with all corners inside an ellipsoid are full (it is convex); those near its surface are sampled on a
-    barycentric lattice of 165 points, so a cut tet's share is good to about 0.01 (0.04 at worst).
+    Tets with all corners inside an ellipsoid are full (it is convex); those near its surface are sampled at 165 points:
+    a share is accurate to about 0.01 (0.04 at worst).
 
     Raises:
-        OrganError: the lesion is outside the organ or smaller than a cell; names the lesion, the value and the rule.
+        OrganError: a lesion outside the organ or smaller than a cell; names the lesion, the value and the rule.
     """
     if lesion.region is not None:
         return (mesh.region == mesh.region_tag(lesion.region)).astype(np.float64)
@@ -192,8 +182,8 @@ def lesion_fraction(mesh: TetMesh, lesion: Lesion) -> FloatArray:
 def lesion_extent(mesh: TetMesh, lesion: Lesion) -> tuple[FloatArray, FloatArray]:
     """Centre [m] and half axes along x, y, z [m] of a lesion, each (3,).
 
-    Those of a tagged region are of the ellipsoid with its centroid and its variances: a solid ellipsoid has a^2 / 5
-    along a half axis a, a tet with corners x_i about the origin (sum x_i^2 + (sum x_i)^2) / 20.
+    A tagged region has those of the ellipsoid with its centroid and variances: a solid ellipsoid has a^2 / 5 along a
+    half axis a, a tet with corners x_i about the origin (sum x_i^2 + (sum x_i)^2) / 20.
     """
     if lesion.region is None:
         return np.asarray(lesion.centre, dtype=np.float64), lesion.half_axes
@@ -209,7 +199,7 @@ def lesion_extent(mesh: TetMesh, lesion: Lesion) -> tuple[FloatArray, FloatArray
 
 
 def tet_samples(corners: FloatArray) -> FloatArray:
-    """165 points spread evenly over each of the tets with corners (n, 4, 3), in their unit, shape (n, 165, 3)."""
+    """165 points, spread evenly over each tet with corners (n, 4, 3), in their unit, shape (n, 165, 3)."""
     return matmul(_BARYCENTRIC_SAMPLES, corners)
 
 
@@ -227,9 +217,9 @@ def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: Flo
     filled = float(matmul(fraction, mesh.volumes))
     share = filled / (4.0 / 3.0 * math.pi * float(axes.prod()))
     if share < LESION_SHARE_INSIDE:
-        where = ", ".join(f"{value * 1000:.1f}" for value in np.asarray(lesion.centre))
+        centre = ", ".join(f"{value * 1000:.1f}" for value in np.asarray(lesion.centre))
         raise OrganError(
-            f"{lesion.name}: only {max(share, 0.0):.0%} of it (centre {where} mm) lies inside the organ; at least "
+            f"{lesion.name}: only {max(share, 0.0):.0%} of it (centre {centre} mm) lies inside the organ; at least "
             f"{LESION_SHARE_INSIDE:.0%} must: move its centre into the organ, or make it smaller (all in metres)"
         )
 
@@ -237,24 +227,24 @@ def _check_lesion(mesh: TetMesh, lesion: Lesion, axes: FloatArray, fraction: Flo
 def mixed_moduli(
     spring_modulus: FloatArray, volume_modulus: FloatArray, material: Material, fraction: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Spring and volume modulus of tets of which a share is filled with another material [Pa], (n_tet,) each.
+    """Spring and volume modulus of tets filled with a fraction of another material [Pa], (n_tet,) each.
 
-    The geometric mean of the shear moduli and of the bulk moduli, the weights being shares of the volume:
-    log mu = (1 - f) log mu_1 + f log mu_2, and log K likewise. Springs give mu = (2/5) E_s and 2/3 E_s of K, the volume
-    term the rest, K = (2/3) E_s + K_t; so K_t stays 0 where both are 0, and is never negative.
+    Geometric means by volume of shear and bulk modulus: log mu = (1 - f) log mu_1 + f log mu_2, and log K likewise.
+    Springs give mu = (2/5) E_s and 2/3 E_s of K, the volume term the remainder, K = (2/3) E_s + K_t; so K_t stays 0 if
+    both are 0, and is never negative.
 
-    The modulus of a tet cut by an interface lies between the arithmetic mean (Voigt: one strain) and the harmonic one
+    The modulus of a tet cut by an interface lies between the arithmetic mean (Voigt: one strain) and the harmonic mean
     (Reuss: one stress; Hill 1952, doi 10.1088/0370-1298/65/5/307). Measured with a lesion of 5 x and cells of half its
-    radius, anywhere on the lattice: the stiffness that it adds to a sheared block is off by +16 % with the arithmetic
-    mean, -4 % with the harmonic one, +5 % with the geometric one; it varies with the place by 1.2, 0.4 and 0.8 %, and
-    by 4.7 % where every tet belongs wholly to one side.
+    radius, anywhere on the lattice: the stiffness added to a sheared block is off by +16 % with the arithmetic mean,
+    -4 % with the harmonic, +5 % with the geometric; it varies with the place by 1.2, 0.4 and 0.8 %, and by 4.7 % with
+    every tet wholly on one side.
     """
     share = 2.0 / 3.0 * spring_modulus
     added = log1p(volume_modulus / share)
     added_by_material = float(log1p(material.volume_modulus / (2.0 / 3.0 * material.spring_modulus)))
     spring = spring_modulus * power(material.spring_modulus / spring_modulus, fraction)
     volume = 2.0 / 3.0 * spring * expm1((1.0 - fraction) * added + fraction * added_by_material)
-    # log and exp round: a tet that the lesion does not reach keeps its modulus to the bit.
+    # log and exp round: tets outside the lesion keep their modulus to the bit.
     return spring, np.where(fraction > 0.0, volume, volume_modulus)
 
 
@@ -286,15 +276,15 @@ def _barycentric_lattice(per_edge: int) -> FloatArray:
 _BARYCENTRIC_SAMPLES = _barycentric_lattice(SAMPLES_PER_EDGE)
 
 
-# Up to this Poisson's ratio the volume term belongs to each tet. Above it tets lock under loads that bend (a cosine
-# load on few cells: 1.48 x too stiff at 0.49 where 0.25 is 1.17 x), so what is above is averaged at nodes.
+# Up to this Poisson's ratio the volume term belongs to each tet. Above it tets lock in bending (a cosine load on few
+# cells: 1.48 x too stiff at 0.49, 1.17 x at 0.25), so the excess is averaged at nodes.
 POISSON_RATIO_PER_TET = 0.40
 
 
 def averaged_volume_modulus(spring_modulus: FloatArray, volume_modulus: FloatArray) -> FloatArray:
-    """Share of each tet's volume modulus that is averaged at nodes, max(0, K_t - 3 mu) [Pa], shape (n_tet,).
+    """Part of each tet's volume modulus averaged at nodes, max(0, K_t - 3 mu) [Pa], shape (n_tet,).
 
-    K_t / mu = (4 nu - 1) / (1 - 2 nu), which is 3 at nu = 0.4, and mu = (2/5) E_s: up to 0.4 the share is 0.
+    K_t / mu = (4 nu - 1) / (1 - 2 nu), which is 3 at nu = 0.4, and mu = (2/5) E_s: up to 0.4 the part is 0.
 
     Args:
         spring_modulus: E_s of each tet [Pa], shape (n_tet,).
@@ -302,12 +292,12 @@ def averaged_volume_modulus(spring_modulus: FloatArray, volume_modulus: FloatArr
     """
     nu = POISSON_RATIO_PER_TET
     most = 0.4 * spring_modulus * ((4.0 * nu - 1.0) / (1.0 - 2.0 * nu))
-    # An organ of exactly that ratio must not be averaged because of rounding.
+    # Rounding must not average an organ of exactly that ratio.
     return np.where(volume_modulus > most * (1.0 + 1e-9), volume_modulus - most, 0.0)
 
 
 def nodal_average(mesh: TetMesh, tet_modulus: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Volume [m^3] and modulus [Pa] that each node has from a quarter of each tet around it, both (n_node,).
+    """Volume [m^3] and modulus [Pa] of each node, from a quarter of each tet around it, both (n_node,).
 
     V_a = sum_t V_t / 4 and K_a = sum_t (V_t / 4) K_t / V_a (averaged volumes: Bonet and Burton 1998).
     """

@@ -12,7 +12,7 @@ STIFFNESS_RULES = ("lloyd", "fitted")
 
 
 def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "lloyd") -> tuple[IntArray, FloatArray]:
-    """One spring per mesh edge; each tet adds to its six edges a share proportional to its modulus.
+    """Springs along the mesh edges, with a share of stiffness from each tet in proportion to its modulus.
 
     * "lloyd": k_ij = sum over tets of (2 sqrt 2 / 25) l_t E_t, l_t = (12 V_t / sqrt 2)^(1/3), the edge of the regular
       tet of the same volume (Sala et al. 2011, eq. 6; Lloyd et al. 2007).
@@ -21,39 +21,28 @@ def spring_network(mesh: TetMesh, youngs_modulus: ArrayLike, *, rule: str = "llo
 
     Args:
         mesh: the organ's tets.
-        youngs_modulus: E [Pa], a scalar or one value a tet, shape (n_tet,).
+        youngs_modulus: E [Pa], a scalar or a value per tet, shape (n_tet,).
         rule: one of STIFFNESS_RULES.
 
     Warns:
-        UserWarning: "fitted" on a mesh where the network cannot represent the solid; names the residual.
+        UserWarning: "fitted" on a mesh whose network cannot represent the solid; names the residual.
 
     Returns:
         edges (n_spring, 2) and stiffness [N/m] (n_spring,), in the order of `mesh.edges`.
 
     Raises:
-        OrganError: an unknown rule (lists the known).
+        OrganError: an unknown rule; lists the known.
     """
     check_stiffness_rule(rule)
     modulus = np.broadcast_to(np.asarray(youngs_modulus, dtype=np.float64), (mesh.tet_count,))
-    return mesh.edges, _summed(mesh, modulus, rule)
+    return mesh.edges, spring_sum(mesh, modulus, rule)
 
 
-def spring_sum(mesh: TetMesh, youngs_modulus: FloatArray, amount: FloatArray, *, rule: str = "lloyd") -> FloatArray:
-    """An amount of each tet summed at the springs, weighted by the stiffness that the tet adds to each.
+def spring_sum(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
+    """Stiffness of the springs, k_ij = sum over tets of k_ij,t [N/m], of moduli (n_tet,) [Pa], shape (n_spring,).
 
-    Args:
-        mesh: the organ's tets.
-        youngs_modulus: E of each tet [Pa], shape (n_tet,).
-        amount: of each tet, shape (n_tet,).
-        rule: as in `spring_network`.
-
-    Returns:
-        Sum over tets of k_ij,t times the amount, in N/m times its unit, in the order of `mesh.edges`, (n_spring,).
+    Linear in the moduli: E_t times an amount of each tet gives the amount's sum, weighted by the shares of stiffness.
     """
-    return _summed(mesh, youngs_modulus * amount, rule)
-
-
-def _summed(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
     share = lloyd_share(mesh, modulus)
     if rule == "fitted":
         share = share * spring_fit(mesh).tet_factor
@@ -62,13 +51,13 @@ def _summed(mesh: TetMesh, modulus: FloatArray, rule: str) -> FloatArray:
 
 
 def check_stiffness_rule(rule: str) -> None:
-    """OrganError where a rule is none of STIFFNESS_RULES: lists them."""
+    """Raise OrganError unless a rule is one of STIFFNESS_RULES."""
     if rule not in STIFFNESS_RULES:
         raise OrganError(f"stiffness rule {rule!r} is unknown; the rules are {', '.join(STIFFNESS_RULES)}")
 
 
 def membrane_stiffness(mesh: TetMesh, youngs_modulus: float, thickness: float) -> FloatArray:
-    """Stiffness that a thin capsule adds to the springs of the surface's edges [N/m], shape (n_spring,).
+    """Stiffness of a thin capsule in the springs of the surface's edges [N/m], shape (n_spring,).
 
     Each surface triangle of area A and edges l1, l2, l3 gives 3 E_c h_c A / (l1^2 + l2^2 + l3^2) to each of its edges:
     a membrane of stiffness E_c h_c with 2-D Poisson ratio 1/3, equal to (sqrt 3 / 4) E_c h_c on equilateral triangles.

@@ -1,4 +1,4 @@
-"""How soft tissue departs from a linear spring: it stiffens with strain and relaxes with time."""
+"""Stiffening of soft tissue with strain and relaxation with time."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from msdm_core.arithmetic import exp
 from msdm_core.errors import OrganError
 from msdm_core.mesh.tet_mesh import FloatArray
 
-# Of a stiffening tissue over that at rest; measured up to here (`stability.HELD_TANGENT`).
+# Validated up to here (`stability.HELD_TANGENT`).
 TANGENT_CAP_LARGEST = 100.0
 # Maxwell arms of a spring.
 ARM_COUNT = 3
@@ -18,19 +18,19 @@ ARM_COUNT = 3
 
 @dataclass(frozen=True)
 class Stiffening:
-    """Tissue that is linear up to an onset strain, then stiffens up to a cap on its tangent.
+    """Linear tissue up to an onset strain, then a rising tangent up to a cap.
 
-    The energy of the linear springs around a node is that of a strain s, s^2 = 5 sum k (l - l0)^2 / sum k l0^2: the
-    strain of a bar of constant volume that is pulled or compressed. The node's springs then have the energy w(s) in
-    place of s^2 / 2: all of them the factor w'(s) / s, a spring the mean of the factors of its two ends. The tangent is
-    w'' = 1 + (c - 1) v^2, v = (s - e0) / (e1 - e0) within 0 and 1: a short toe and a steep rise as in Fung's
-    exponential law (1967), as a piecewise polynomial, whose values have the same bits on every machine. A node feels
-    all directions, so that stiffening tissue is as isotropic as its linear springs nearly are; were each spring to
-    stiffen by its own strain, the seven directions of a lattice would make a cubic solid, whose columns buckle.
+    The springs around a node have the equivalent strain s, s^2 = 5 sum k (l - l0)^2 / sum k l0^2: the strain of a bar
+    of constant volume in tension or compression. Their energy is w(s) in place of s^2 / 2: a node multiplies tension by
+    w'(s) / s, a spring by the mean over its two ends. The tangent is w'' = 1 + (c - 1) v^2, v = (s - e0) / (e1 - e0)
+    within 0 and 1: a short toe and a steep rise as in Fung's exponential law (1967), as a piecewise polynomial, which
+    has the same bits on every machine. The strain of a node includes all directions, so stiffening tissue stays nearly
+    isotropic; if each spring stiffened by its own strain, the seven directions of a lattice would make a cubic solid
+    with buckling columns.
 
     Args:
-        onset_strain: e0, up to which the tissue is linear, at least 0.
-        cap_strain: e1, from which the tangent is constant, above e0.
+        onset_strain: e0, the end of linear tissue, at least 0.
+        cap_strain: e1, the beginning of the constant tangent, above e0.
         tangent_cap: c, the largest tangent over that at rest, from 1 to 100.
 
     Raises:
@@ -112,7 +112,7 @@ class Relaxation:
 
     @property
     def instantaneous(self) -> float:
-        """Tension at once after a step of strain, over that at equilibrium: 1 + sum g_i."""
+        """Tension immediately after a step of strain, over that at equilibrium: 1 + sum g_i."""
         return 1.0 + math.fsum(self.relative_moduli)
 
     def remaining(self, time: ArrayLike) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What carries points near the boundary of a body of tets: the nearest point of the boundary, and gradients there."""
+"""Points near the boundary of a body of tets: their carriers, the nearest points of the boundary; gradients there."""
 
 from dataclasses import dataclass
 
@@ -11,24 +11,24 @@ from msdm_core.errors import MeshError
 from msdm_core.mesh.geodesic import nearest_weights
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
-# A point is carried to this share of the tets' longest edges at its nearest point of the boundary.
+# Largest distance of a carried point, as a share of the tets' longest edges at its nearest point of the boundary.
 REACH = 0.75
-# A vertex that was within its reach still is when a file has rounded its coordinates to single precision.
+# Tolerance of the reach for coordinates rounded to single precision by a file.
 ROUNDING = 1e-3
-# Triangles of a size that are tried first near a point, and points that are tried at once.
+# Nearest triangles of a size in the first search, and points in a search.
 NEAR_FIRST, POINTS_AT_ONCE = 8, 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Carriers:
-    """For each of some points the nearest point of a mesh's boundary.
+    """Nearest points of a mesh's boundary.
 
     Fields:
         triangle: the boundary triangle                                             (n_point,)
         weights: of its corners at the nearest point, none below 0                  (n_point, 3)
-        nearest: that point [m]                                                     (n_point, 3)
+        nearest: the nearest point [m]                                              (n_point, 3)
         distance: from it [m]                                                       (n_point,)
-        reach: largest distance at which a point is carried there [m]               (n_point,)
+        reach: largest distance of a carried point there [m]                        (n_point,)
     """
 
     triangle: IntArray
@@ -39,17 +39,17 @@ class Carriers:
 
     @property
     def beyond(self) -> NDArray[np.bool_]:
-        """Which points are too far from the boundary to be carried, (n_point,)."""
+        """True for points too far from the boundary to be carried, (n_point,)."""
         return self.distance > self.reach
 
 
 def find_carriers(points: FloatArray, mesh: TetMesh) -> Carriers:
-    """What carries points [m] (n_point, 3) near the boundary of a mesh."""
+    """Nearest points of a mesh's boundary to points [m] (n_point, 3)."""
     corners = mesh.points[mesh.boundary_triangles]
     triangle, weights = _nearest_triangles(points, corners)
     nearest = (weights[:, :, None] * corners[triangle]).sum(axis=1)
-    # Interpolated between nodes: where triangles share the nearest point, rounding decides which of them is found, and
-    # the reach must not depend on it.
+    # Interpolated between nodes: rounding decides between triangles that share the nearest point, and must not change
+    # the reach.
     longest = _longest_edges(mesh)[mesh.boundary_triangles[triangle]]
     reach = REACH * dot(weights, longest)
     return Carriers(triangle, weights, nearest, norm(points - nearest, axis=1), reach)
@@ -65,30 +65,31 @@ def _longest_edges(mesh: TetMesh) -> FloatArray:
 
 
 def surface_carriers(vertices: FloatArray, mesh: TetMesh) -> Carriers:
-    """What carries the vertices [m] (n_vertex, 3) of a finer surface of a mesh.
+    """Carriers of the vertices [m] (n_vertex, 3) of a finer surface of a mesh.
 
     Raises:
-        MeshError: a vertex farther from the mesh's boundary than REACH allows; names it.
+        MeshError: a vertex farther from the mesh's boundary than its reach; names it.
     """
-    found = find_carriers(vertices, mesh)
-    far = np.flatnonzero(found.distance > (1.0 + ROUNDING) * found.reach)
+    carriers = find_carriers(vertices, mesh)
+    distance, reach = carriers.distance, carriers.reach
+    far = np.flatnonzero(distance > (1.0 + ROUNDING) * reach)
     if far.size:
-        worst = far[np.argmax(found.distance[far] / found.reach[far])]
+        worst = far[np.argmax(distance[far] / reach[far])]
         x, y, z = vertices[worst] * 1e3
         raise MeshError(
-            f"vertex {worst} of the fine surface, at {x:.1f}, {y:.1f}, {z:.1f} mm, is "
-            f"{found.distance[worst] * 1e3:.3g} mm from the boundary of the tets; the rule is at most "
-            f"{found.reach[worst] * 1e3:.3g} mm there, {REACH:g} of the tets' longest edges ({len(far)} of "
-            f"{len(vertices)} vertices break it): is it the surface of this organ, in the same axes and unit?"
+            f"vertex {worst} of the fine surface, at {x:.1f}, {y:.1f}, {z:.1f} mm, is {distance[worst] * 1e3:.3g} mm "
+            f"from the boundary of the tets; the rule is at most {reach[worst] * 1e3:.3g} mm there, {REACH:g} of the "
+            f"tets' longest edges ({len(far)} of {len(vertices)} vertices break it): is it the surface of this organ, "
+            "in the same axes and unit?"
         )
-    return found
+    return carriers
 
 
 def node_gradients(mesh: TetMesh, nodes: IntArray) -> csr_array:
-    """Gradients at nodes (n,) of functions given at all nodes: the mean over the tets around each, by volume.
+    """Gradients at nodes (n,) of functions of the nodes: the mean over the tets around each, by volume.
 
-    Exact where the function is linear. In a tet with corners x_a and volume V the gradient of corner a's function is
-    the area vector of the face opposite over 3 V (Zienkiewicz and Taylor, The Finite Element Method, linear tets).
+    Exact for linear functions. In a tet with corners x_a and volume V the gradient of corner a's function is the area
+    vector of the face opposite over 3 V (Zienkiewicz and Taylor, The Finite Element Method, linear tets).
 
     Returns:
         The operator [1/m]: rows 3 i to 3 i + 2 give the gradient's components at nodes[i], (3 n, n_node).
@@ -110,7 +111,7 @@ def node_gradients(mesh: TetMesh, nodes: IntArray) -> csr_array:
 
 
 def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The triangle nearest to each point, and weights of its corners at its nearest point."""
+    """Triangle nearest to each point, and weights of its corners at its nearest point."""
     from scipy.spatial import KDTree
 
     triangle, weights = np.zeros(len(points), dtype=np.int32), np.zeros((len(points), 3))
@@ -119,29 +120,29 @@ def _nearest_triangles(points: FloatArray, corners: FloatArray) -> tuple[IntArra
     radius = norm(corners - centre[:, None], axis=2).max(axis=1)
     # Triangles of about one size, the small ones first: those of a graded mesh differ by a factor of 4.
     _, size = np.frexp(np.square(radius / radius.min()))
-    for one in np.unique(size):
-        some = np.flatnonzero(size == one)
-        tree, reach, count = KDTree(centre[some]), float(radius[some].max()), min(NEAR_FIRST, len(some))
-        sought = np.arange(len(points))
-        while len(sought):
+    for level in np.unique(size):
+        alike = np.flatnonzero(size == level)
+        tree, reach, count = KDTree(centre[alike]), float(radius[alike].max()), min(NEAR_FIRST, len(alike))
+        open_points = np.arange(len(points))
+        while len(open_points):
             left = []
-            for first in range(0, len(sought), POINTS_AT_ONCE):
-                now = sought[first : first + POINTS_AT_ONCE]
-                away, near = (np.reshape(one, (-1, count)) for one in tree.query(points[now], k=count))
+            for first in range(0, len(open_points), POINTS_AT_ONCE):
+                batch = open_points[first : first + POINTS_AT_ONCE]
+                away, near = (np.reshape(array, (-1, count)) for array in tree.query(points[batch], k=count))
                 # A triangle is nearer than its centre by its radius at most.
-                useful = away - reach < gap[now, None]
+                useful = away - reach < gap[batch, None]
                 row, column = np.nonzero(useful)
-                tried = some[near[row, column]]
-                mixed = nearest_weights(corners[tried], points[now[row]])
-                found = np.full(away.shape, np.inf)
-                found[useful] = norm((mixed[:, :, None] * corners[tried]).sum(axis=1) - points[now[row]], axis=1)
-                best = found.argmin(axis=1)
-                nearer = np.flatnonzero(found[np.arange(len(now)), best] < gap[now])
+                tried = alike[near[row, column]]
+                mixed = nearest_weights(corners[tried], points[batch[row]])
+                distance = np.full(away.shape, np.inf)
+                distance[useful] = norm((mixed[:, :, None] * corners[tried]).sum(axis=1) - points[batch[row]], axis=1)
+                best = distance.argmin(axis=1)
+                nearer = np.flatnonzero(distance[np.arange(len(batch)), best] < gap[batch])
                 place = (np.cumsum(useful).reshape(useful.shape) - 1)[nearer, best[nearer]]
-                gap[now[nearer]] = found[nearer, best[nearer]]
-                triangle[now[nearer]], weights[now[nearer]] = tried[place], mixed[place]
-                left.append(now[away[:, -1] - reach < gap[now]])
-            if count == len(some):
+                gap[batch[nearer]] = distance[nearer, best[nearer]]
+                triangle[batch[nearer]], weights[batch[nearer]] = tried[place], mixed[place]
+                left.append(batch[away[:, -1] - reach < gap[batch]])
+            if count == len(alike):
                 break
-            sought, count = np.concatenate(left), min(4 * count, len(some))
+            open_points, count = np.concatenate(left), min(4 * count, len(alike))
     return triangle, weights

@@ -1,4 +1,4 @@
-"""Distance along a surface: shortest paths on a graph of its vertices and points on its edges."""
+"""Distances along a surface (shortest paths on a graph of vertices and points on edges) and nearest triangles."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,15 +8,15 @@ from scipy.sparse.csgraph import dijkstra
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
-# Points put on each edge, besides its ends. Paths run between them: 2 % longer than the true geodesic over several
-# triangles, and off by up to the gap between two such points (an eighth of an edge) over less than one.
+# Points on each edge between its ends. Paths between them are 2 % longer than the true geodesic over several triangles,
+# and off by up to the gap of two points (an eighth of an edge) over less than one.
 POINTS_PER_EDGE = 7
-# Points whose distances to all triangles are held at once: 10 MB for a surface of 10 000 triangles.
+# Points with distances to all triangles in memory: 10 MB for a surface of 10 000 triangles.
 QUERIES_AT_ONCE = 64
 
 
 class SurfaceDistance:
-    """Distances along a triangle surface, after Lanthier et al. 2001 (Steiner points on edges, Dijkstra's algorithm).
+    """Distances along a triangle surface (Lanthier et al. 2001: Steiner points on edges, Dijkstra's algorithm).
 
     Args:
         points: vertex positions [m], shape (n_point, 3).
@@ -47,7 +47,7 @@ class SurfaceDistance:
     def __call__(self, source: ArrayLike, targets: ArrayLike) -> FloatArray:
         """Distance along the surface from a point (3,) to points (n, 3) [m], each first dropped onto the surface.
 
-        Where no path leads (another body), the distance is infinite.
+        Infinite without a path (another body).
         """
         queries = np.concatenate([np.reshape(source, (1, 3)), np.reshape(targets, (-1, 3))]).astype(np.float64)
         located = [self._nearest(query) for query in queries]
@@ -75,7 +75,7 @@ def nearest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
 
     Args:
         corners: triangle corners [m], shape (n_triangle, 3, 3).
-        query: a point [m] for all, shape (3,), or one for each triangle, shape (n_triangle, 3).
+        query: a point [m] for all, shape (3,), or a point for each triangle, shape (n_triangle, 3).
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac, ap = b - a, c - a, query - a
@@ -85,7 +85,7 @@ def nearest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
     wb = (d11 * d20 - d01 * d21) / determinant
     wc = (d00 * d21 - d01 * d20) / determinant
     weights = np.column_stack([1.0 - wb - wc, wb, wc])
-    # Where the foot of the perpendicular misses the triangle, the nearest point lies on one of its edges.
+    # If the foot of the perpendicular misses the triangle, the nearest point lies on an edge.
     outside = (weights < 0.0).any(axis=1)
     smallest = np.full(len(corners), np.inf)
     for first, second in ((0, 1), (1, 2), (2, 0)):
@@ -101,7 +101,7 @@ def nearest_weights(corners: FloatArray, query: FloatArray) -> FloatArray:
 
 
 class NearestTriangle:
-    """The triangle nearest to a point; balls around the triangles exclude most of them.
+    """Search for the triangle nearest to a point; balls around the triangles exclude most of them.
 
     Args:
         corners: triangle corners [m], shape (n_triangle, 3, 3).
@@ -127,14 +127,15 @@ class NearestTriangle:
 
     def distances(self, queries: FloatArray) -> FloatArray:
         """Distance from points (n, 3) to their nearest triangles [m], shape (n,)."""
-        found = []
+        distances = np.zeros(len(queries))
         for start in range(0, len(queries), QUERIES_AT_ONCE):
-            some = queries[start : start + QUERIES_AT_ONCE]
-            away = norm(some[:, None] - self._centre, axis=2)
+            batch = queries[start : start + QUERIES_AT_ONCE]
+            away = norm(batch[:, None] - self._centre, axis=2)
             query, near = np.nonzero(~(away - self._radius > away.min(axis=1, keepdims=True) * (1.0 + 1e-9)))
             corners = self.corners[near]
-            weights = nearest_weights(corners, some[query])
-            gap = norm((weights[:, :, None] * corners).sum(axis=1) - some[query], axis=1)
+            weights = nearest_weights(corners, batch[query])
+            gap = norm((weights[:, :, None] * corners).sum(axis=1) - batch[query], axis=1)
             # Each point has at least one triangle, and they are sorted by points.
-            found.append(np.minimum.reduceat(gap, np.searchsorted(query, np.arange(len(some)))))
-        return np.concatenate(found) if found else np.zeros(0)
+            first = np.searchsorted(query, np.arange(len(batch)))
+            distances[start : start + QUERIES_AT_ONCE] = np.minimum.reduceat(gap, first)
+        return distances

@@ -1,9 +1,9 @@
-"""The order of springs and tets for the kernels: near in space is near in memory, but not adjacent.
+"""Order of springs and tets for the kernels: near in space is near in memory, but not adjacent.
 
-Eight organs side by side (`tissue_kernels`) need 64 bytes for each number of a node, more than the fast caches
-hold of a whole mesh: tets in the order of a sweep find their nodes there. Two tets of one node in a row would wait for
-each other's sums, so neighbours stand a few places apart. And each tet brings one spring along its first edge: its two
-ends are at hand already. Phantom, eight organs in float64: 27 % less time by the sweep, 9 % more by the springs.
+Eight organs side by side (`tissue_kernels`) need 64 bytes for each number of a node, so that the fast caches hold only
+a part of a mesh: tets in the order of a sweep find their nodes there. Two successive tets of one node would wait for
+each other's sums, so neighbours stand a few places apart. Each tet comes with a spring along its first edge, whose ends
+are loaded already. Phantom, eight organs in float64: 27 % less time by the sweep, another 9 % less by the springs.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from msdm_core.arithmetic import norm
 from msdm_core.kernels.layout_kernels import spread_order
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 
-# Items that share a node are placed at least this far apart, where one of the next WINDOW items allows it.
+# Items of a common node stand at least GAP places apart, if one of the next WINDOW items allows it.
 GAP = 8
 WINDOW = 64
-# Even permutations of a tet's corners that bring the two of TET_EDGES[k] to the front, (6, 4).
+# Even permutations of a tet's corners with the two of TET_EDGES[k] in front, (6, 4).
 EDGE_FIRST = np.array([[0, 1, 2, 3], [0, 2, 3, 1], [0, 3, 1, 2], [1, 2, 0, 3], [1, 3, 2, 0], [2, 3, 0, 1]])
 
 
@@ -31,7 +31,7 @@ class SpringOrder:
 
     Fields:
         tet_nodes: the mesh's tets, corners turned so that spring t is the first edge of tet t      (n_tet, 4)
-        springs: the mesh's edges in order: one for each tet, then the remaining ones          (n_spring,)
+        springs: the mesh's edges in order: one for each tet, then the remaining ones               (n_spring,)
     """
 
     tet_nodes: IntArray
@@ -39,13 +39,13 @@ class SpringOrder:
 
 
 def in_sweep_order(mesh: TetMesh) -> TetMesh:
-    """The same mesh with its tets in an order that suits the kernels; `box_mesh` and `mesh_surface` already use it."""
+    """The same mesh with its tets in the order of the kernels; `box_mesh` and `mesh_surface` already use it."""
     order = swept(mesh.points, mesh.tets)
     return TetMesh(mesh.points, mesh.tets[order], mesh.region[order], mesh.region_names)
 
 
 def swept(points: FloatArray, items: NDArray[np.integer]) -> NDArray[np.intp]:
-    """An order of springs or tets along the longest axis, slice by slice, with those that share a node kept apart.
+    """Order of springs or tets along the longest axis, slice by slice, with those of a common node apart, (n_item,).
 
     Args:
         points: node positions [m], shape (n_node, 3).
@@ -67,7 +67,7 @@ _ORDERS: WeakKeyDictionary[TetMesh, SpringOrder] = WeakKeyDictionary()
 
 
 def spring_order(mesh: TetMesh) -> SpringOrder:
-    """The order of the springs of a mesh, computed once for each mesh; one that was moved has that of its origin."""
+    """Order of the springs of a mesh, computed once per mesh; a moved mesh has that of its origin."""
     mesh = mesh if mesh.origin is None else mesh.origin
     if mesh not in _ORDERS:
         _ORDERS[mesh] = _matched(mesh)
@@ -75,10 +75,10 @@ def spring_order(mesh: TetMesh) -> SpringOrder:
 
 
 def _matched(mesh: TetMesh) -> SpringOrder:
-    """One spring for each tet, by bipartite matching, then the remaining springs in the order of a sweep.
+    """A spring for each tet, by bipartite matching, then the remaining springs in the order of a sweep.
 
     Any set of tets has more edges than tets (Euler: edges - tets = nodes + half the outer triangles - 1 for a ball), so
-    that by Hall's theorem each tet can have one of its own.
+    that by Hall's theorem each tet can have an edge of its own.
     """
     tets = np.repeat(np.arange(mesh.tet_count), 6)
     shape = (mesh.tet_count, len(mesh.edges))

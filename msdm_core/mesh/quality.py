@@ -1,4 +1,4 @@
-"""Quality of a mesh: the shape of its tets, and its fit to the surface from which it was made."""
+"""Quality of a mesh: shapes of its tets, fit to a surface."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import arccos, cbrt, dot, norm
 from msdm_core.mesh.surface import surface_volume
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, area_vectors
 
 
 @dataclass(frozen=True)
@@ -21,19 +21,19 @@ class MeshQuality:
     dihedral_largest_deg: float  # [degrees]; 90 on a BCC lattice
     radius_ratio_smallest: float  # 3 inradius / circumradius: 1 for a regular tet, 0 for a flat one
     volume: float  # [m^3]
-    volume_error: float | None  # (mesh - surface) / surface; None where no surface was given
+    volume_error: float | None  # (mesh - surface) / surface; None without a surface
 
 
 def mesh_quality(mesh: TetMesh, surface: tuple[ArrayLike, ArrayLike] | None = None) -> MeshQuality:
-    """Measure a mesh.
+    """Quality figures of a mesh.
 
     Args:
         mesh: the mesh.
-        surface: vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3) that it should fill, if any.
+        surface: vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3) of the filled surface, if any.
     """
     angles = dihedral_angles(mesh)
     volume = float(mesh.volumes.sum())
-    wanted = surface_volume(*surface) if surface is not None else None
+    filled = None if surface is None else surface_volume(*surface)
     return MeshQuality(
         node_count=mesh.node_count,
         tet_count=mesh.tet_count,
@@ -42,7 +42,7 @@ def mesh_quality(mesh: TetMesh, surface: tuple[ArrayLike, ArrayLike] | None = No
         dihedral_largest_deg=float(angles.max()),
         radius_ratio_smallest=float(radius_ratios(mesh).min()),
         volume=volume,
-        volume_error=None if wanted is None else (volume - wanted) / wanted,
+        volume_error=None if filled is None else (volume - filled) / filled,
     )
 
 
@@ -53,7 +53,7 @@ def dihedral_angles(mesh: TetMesh) -> FloatArray:
 
 def tet_angles(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     """`dihedral_angles` of tets with positive volumes [degrees], shape (n_tet, 6)."""
-    normals = _face_area_vectors(points, tets)
+    normals = area_vectors(points[tets[:, TET_FACES]])
     normals = normals / norm(normals, axis=2, keepdims=True)
     i, j = np.triu_indices(4, k=1)
     cosines = -dot(normals[:, i], normals[:, j])
@@ -65,7 +65,7 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
 
     V is the volume, S the area of the four faces, a, b, c the edges from corner 0 (Liu and Joe 1994).
     """
-    area = norm(_face_area_vectors(mesh.points, mesh.tets), axis=2).sum(axis=1)
+    area = norm(area_vectors(mesh.points[mesh.tets[:, TET_FACES]]), axis=2).sum(axis=1)
     corners = mesh.points[mesh.tets]
     a, b, c = (corners[:, corner] - corners[:, 0] for corner in (1, 2, 3))
     parts = [(p * p).sum(axis=1, keepdims=True) * np.cross(q, r) for p, q, r in ((a, b, c), (b, c, a), (c, a, b))]
@@ -74,14 +74,8 @@ def radius_ratios(mesh: TetMesh) -> FloatArray:
     return 3 * (3 * mesh.volumes / area) / circumradius
 
 
-def _face_area_vectors(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
-    """Outward normal times area of the face opposite each corner [m^2], shape (n_tet, 4, 3)."""
-    a, b, c = (points[tets[:, TET_FACES[:, corner]]] for corner in range(3))
-    return np.cross(b - a, c - a) / 2
-
-
 def surface_cell(mesh: TetMesh, triangles: NDArray[np.int32]) -> float:
-    """Edge a of the cubic lattice cell whose tets, of a^3 / 12, have the median volume of those at a surface [m].
+    """Cell edge a of the BCC lattice with tets (volume a^3 / 12) of the median volume of those at a surface [m].
 
     Args:
         mesh: the organ.

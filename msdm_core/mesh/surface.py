@@ -1,22 +1,26 @@
-"""Triangle surfaces: checks that one encloses a single body, crossings with straight lines, splitting of triangles."""
+"""Closed triangle surfaces: validity, normals, crossings with straight lines, subdivision."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from msdm_core.arithmetic import cos, matmul, norm
 from msdm_core.errors import MeshError
 from msdm_core.kernels.ray_kernels import pierces
+from msdm_core.mesh.tet_mesh import (
+    FloatArray,
+    Int64Array,
+    area_vectors,
+    check_finite,
+    check_indices,
+    connected_parts,
+    part_sizes,
+)
 
-FloatArray = NDArray[np.float64]
-Int64Array = NDArray[np.int64]
-
-# A triangle lower than this share of its longest edge has no direction.
+# Smallest height of a triangle, as a share of its longest edge: a lower one has no direction.
 DEGENERATE_HEIGHT_RATIO = 1e-9
 
-# Shift of the vertices, as a share of the surface's size, before self-crossing is tested: coplanar and touching
-# triangles then either cross or do not, and no test has to deal with a determinant of zero.
+# Shift of the vertices, as a share of the surface's size, for the test of self-crossing: coplanar and touching
+# triangles then either cross or do not, and no determinant is zero.
 CROSSING_SHIFT = 1e-11
 
 
@@ -30,7 +34,7 @@ def surface_volume(vertices: ArrayLike, triangles: ArrayLike) -> float:
 def triangles_facing(
     vertices: ArrayLike, triangles: ArrayLike, direction: ArrayLike, angle_deg: float
 ) -> NDArray[np.bool_]:
-    """Whether each triangle's inward normal is within an angle [degrees] of a direction, shape (n_triangle,).
+    """True for triangles with an inward normal within an angle of a direction, shape (n_triangle,).
 
     Args:
         vertices: of a closed surface [m], shape (n_vertex, 3).
@@ -44,23 +48,21 @@ def triangles_facing(
 def outward_facing(
     points: FloatArray, triangles: NDArray[np.integer], direction: ArrayLike, angle_deg: float
 ) -> NDArray[np.bool_]:
-    """`triangles_facing` for triangles that are known to turn outward."""
-    a, b, c = (points[corner] for corner in triangles.T)
-    normal = np.cross(b - a, c - a)
+    """`triangles_facing` for triangles in outward order."""
+    normal = area_vectors(points[triangles])
     along = np.asarray(direction, dtype=np.float64)
     cosine = -matmul(normal, along) / (norm(normal, axis=1) * norm(along))
     return cosine >= cos(np.radians(angle_deg))
 
 
 def node_normals(points: FloatArray, triangles: NDArray[np.integer]) -> FloatArray:
-    """Unit outward normal at each node, the mean of its triangles' weighted by their areas; 0 without any (n_node, 3).
+    """Unit outward normal at each node, the area-weighted mean of its triangles', 0 without any, shape (n_node, 3).
 
     Args:
         points: nodes [m], shape (n_node, 3).
         triangles: corners in outward order, shape (n_triangle, 3).
     """
-    corners = points[triangles]
-    area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area_vector = area_vectors(points[triangles])
     normals = np.zeros_like(points)
     for corner in range(3):
         np.add.at(normals, triangles[:, corner], area_vector)
@@ -70,7 +72,7 @@ def node_normals(points: FloatArray, triangles: NDArray[np.integer]) -> FloatArr
 
 
 def merge_vertices(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArray, Int64Array]:
-    """Give exactly coinciding vertices one number (an STL file shares none) and drop the unused ones."""
+    """Merge exactly coinciding vertices (an STL file shares none) and drop the unused ones."""
     points, corners = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
     _, first, same = np.unique(points, axis=0, return_index=True, return_inverse=True)
     kept = first[same.ravel()][corners]
@@ -79,23 +81,22 @@ def merge_vertices(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArra
 
 
 def check_surface(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArray, Int64Array]:
-    """The surface with merged vertices and outward normals, or an error that says why it encloses no single body.
+    """The surface of a single body, with merged vertices and outward normals.
 
     Args:
         vertices: [m], shape (n_vertex, 3).
         triangles: vertex indices, shape (n_triangle, 3).
 
     Raises:
-        MeshError: names the first vertex, triangle or edge (in merged numbering, with its place [m]) that is not
-            finite, out of range, degenerate, open, shared by more than two triangles or self-crossing, or the
-            sizes of the bodies where there is more than one.
+        MeshError: a surface that encloses no single body: names the first vertex, triangle or edge (in merged
+            numbering, with its place [m]) that is not finite, out of range, degenerate, open, shared by more than two
+            triangles or self-crossing, or the sizes of several bodies.
     """
     points, corners = merge_vertices(*_checked_arrays(vertices, triangles))
     _check_shape(points, corners)
-    edge_of_side, forward = _paired_sides(points, corners)
-    left, right = edge_of_side
+    left, right, opposed = _paired_sides(points, corners)
     _check_one_body(left, right, len(corners))
-    corners = _oriented(corners, left, right, forward)
+    corners = _oriented(corners, left, right, opposed)
     if surface_volume(points, corners) < 0:
         corners = corners[:, ::-1].copy()
     _check_no_crossing(points, corners)
@@ -106,36 +107,27 @@ def _checked_arrays(vertices: ArrayLike, triangles: ArrayLike) -> tuple[FloatArr
     points, corners = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
     if corners.size == 0:
         raise MeshError("the surface has no triangles; a body needs a closed surface: read or make one first")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if bad.size:
-        raise MeshError(
-            f"vertex {bad[0]} is at {points[bad[0]].tolist()}; every coordinate must be finite: repair the file"
-        )
-    outside = np.flatnonzero(((corners < 0) | (corners >= len(points))).any(axis=1))
-    if outside.size:
-        raise MeshError(
-            f"triangle {outside[0]} uses vertices {corners[outside[0]].tolist()}; "
-            f"indices must lie in 0..{len(points) - 1}"
-        )
+    check_finite(points, "vertex")
+    check_indices(corners, len(points), "triangle", "vertices")
     return points, corners.astype(np.int64)
 
 
 def _check_shape(points: FloatArray, corners: Int64Array) -> None:
     a, b, c = (points[corner] for corner in corners.T)
     longest = np.max([np.square(p - q).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    doubled_area = norm(np.cross(b - a, c - a), axis=1)
-    flat = np.flatnonzero(doubled_area <= DEGENERATE_HEIGHT_RATIO * longest)
+    area = norm(area_vectors(points[corners]), axis=1)
+    flat = np.flatnonzero(2.0 * area <= DEGENERATE_HEIGHT_RATIO * longest)
     if flat.size:
         triangle = int(flat[0])
         raise MeshError(
             f"triangle {triangle} (of {flat.size}) at {_place(a[triangle])} is degenerate: area "
-            f"{doubled_area[triangle] / 2:.2g} m^2, the rule is a height above {DEGENERATE_HEIGHT_RATIO:g} of the "
+            f"{area[triangle]:.2g} m^2, the rule is a height above {DEGENERATE_HEIGHT_RATIO:g} of the "
             "longest edge: remove it, or merge its corners"
         )
 
 
-def _paired_sides(points: FloatArray, corners: Int64Array) -> tuple[tuple[Int64Array, Int64Array], NDArray[np.bool_]]:
-    """The two triangles at each edge, ((n_edge,), (n_edge,)), and per edge whether they run along it both ways."""
+def _paired_sides(points: FloatArray, corners: Int64Array) -> tuple[Int64Array, Int64Array, NDArray[np.bool_]]:
+    """The two triangles at each edge, and True where they run along it in opposite directions, shape (n_edge,) each."""
     sides = corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     low, high = sides.min(axis=1), sides.max(axis=1)
     edges, edge_of_side, count = np.unique(low * len(points) + high, return_inverse=True, return_counts=True)
@@ -151,34 +143,31 @@ def _paired_sides(points: FloatArray, corners: Int64Array) -> tuple[tuple[Int64A
             )
     order = np.argsort(edge_of_side.ravel(), kind="stable").reshape(-1, 2)
     opposed = sides[order[:, 0], 0] != sides[order[:, 1], 0]
-    return (order[:, 0] // 3, order[:, 1] // 3), opposed
+    return order[:, 0] // 3, order[:, 1] // 3, opposed
 
 
 def _check_one_body(left: Int64Array, right: Int64Array, triangle_count: int) -> None:
-    graph = coo_array((np.ones(len(left), dtype=np.int8), (left, right)), shape=(triangle_count, triangle_count))
-    count, label = connected_components(graph, directed=False)
+    count, part = connected_parts(left, right, triangle_count)
     if count > 1:
-        sizes = ", ".join(map(str, np.sort(np.bincount(label))[::-1][:6]))
         raise MeshError(
-            f"the surface falls into {count} bodies (or a body and its cavities) of {sizes}"
-            f"{', ...' if count > 6 else ''} triangles; an organ is one body: keep the largest, or mesh each alone"
+            f"the surface falls into {count} bodies (or a body and its cavities) of {part_sizes(part)} triangles; "
+            "an organ is one body: keep the largest, or mesh each alone"
         )
 
 
 def _oriented(corners: Int64Array, left: Int64Array, right: Int64Array, opposed: NDArray[np.bool_]) -> Int64Array:
-    """Triangles with one orientation; found on the double cover, which has each triangle once in either orientation."""
+    """Triangles of one orientation, by parts of the double cover: each triangle once in either orientation."""
     n = len(corners)
     across = np.where(opposed, 0, n)
-    rows = np.concatenate([left, left + n])
-    columns = np.concatenate([right + across, right + n - across])
-    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * n, 2 * n))
-    _, label = connected_components(graph, directed=False)
-    if label[0] == label[n]:
+    _, part = connected_parts(
+        np.concatenate([left, left + n]), np.concatenate([right + across, right + n - across]), 2 * n
+    )
+    if part[0] == part[n]:
         raise MeshError(
             "the surface has one side only (like a Klein bottle), so it cannot be oriented; "
             "a body needs an inside: repair the surface in a mesh editor"
         )
-    turned = label[:n] != label[0]
+    turned = part[:n] != part[0]
     return np.where(turned[:, None], corners[:, ::-1], corners)
 
 
@@ -189,21 +178,20 @@ def _check_no_crossing(points: FloatArray, corners: Int64Array) -> None:
     shifted = (points - points.mean(axis=0)) / size + shift
     first, second = _near_pairs(shifted, corners)
     crossing = np.zeros(len(first), dtype=bool)
-    for one, other in ((first, second), (second, first)):
+    for piercing, pierced in ((first, second), (second, first)):
         for side in ([0, 1], [1, 2], [2, 0]):
-            crossing |= _pierces(shifted, corners[one][:, side], corners[other])
-    found = np.flatnonzero(crossing)
-    if found.size:
-        one, other = int(first[found[0]]), int(second[found[0]])
+            crossing |= _pierces(shifted, corners[piercing][:, side], corners[pierced])
+    if crossing.any():
+        pair = np.argmax(crossing)
         raise MeshError(
-            f"triangles {one} and {other} (of {found.size} pairs) cross each other near "
-            f"{_place(points[corners[one]].mean(axis=0))}; a surface must not cross itself: "
+            f"triangles {first[pair]} and {second[pair]} (of {crossing.sum()} pairs) cross each other near "
+            f"{_place(points[corners[first[pair]]].mean(axis=0))}; a surface must not cross itself: "
             "repair it in a mesh editor, for instance by a boolean union"
         )
 
 
 def _near_pairs(points: FloatArray, corners: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """Pairs of triangles whose bounding boxes overlap, from grids whose cells double from level to level."""
+    """Pairs of triangles with overlapping bounding boxes, from grids with cells doubled from level to level."""
     low, high = points[corners].min(axis=1), points[corners].max(axis=1)
     extent = (high - low).max(axis=1)
     mantissa, exponent = np.frexp(extent / np.median(extent))
@@ -229,7 +217,7 @@ def _near_pairs(points: FloatArray, corners: Int64Array) -> tuple[Int64Array, In
 
 
 def _cells_of(low: FloatArray, high: FloatArray, items: Int64Array, cell: float) -> tuple[Int64Array, Int64Array]:
-    """Numbers of the grid cells that boxes up to one cell wide touch, and the item of each."""
+    """Numbers of the grid cells touched by boxes up to one cell wide, and the item of each."""
     span = int(2.2 / cell) + 4  # points lie in -1..1
     first, last = np.floor(low / cell).astype(np.int64), np.floor(high / cell).astype(np.int64)
     keys, owners = [], []
@@ -242,13 +230,13 @@ def _cells_of(low: FloatArray, high: FloatArray, items: Int64Array, cell: float)
 
 
 def _ranges(start: Int64Array, stop: Int64Array) -> Int64Array:
-    """The whole numbers of all ranges start..stop - 1, one range after the other."""
+    """Whole numbers of all ranges start..stop - 1, range after range."""
     count = stop - start
     return np.arange(count.sum()) + np.repeat(start - np.concatenate([[0], np.cumsum(count)[:-1]]), count)
 
 
 def _pierces(points: FloatArray, segment: Int64Array, triangle: Int64Array) -> NDArray[np.bool_]:
-    """Whether segments pass through triangles with which they share no vertex, shape (n,)."""
+    """True for segments through triangles with which they share no vertex, shape (n,)."""
     result = np.zeros(len(segment), dtype=bool)
     apart = np.flatnonzero((segment[:, :, None] != triangle[:, None, :]).all(axis=(1, 2)))
     start, end = (points[corner] for corner in segment[apart].T)
@@ -265,10 +253,10 @@ def _place(point: FloatArray) -> str:
 def line_hits(
     u: FloatArray, v: FloatArray, w: FloatArray, triangles: Int64Array, offset: int
 ) -> tuple[Int64Array, Int64Array, FloatArray]:
-    """Where the lines u = offset + 2 i, v = offset + 2 j (i, j whole) cross the triangles: their u, v and the w there.
+    """Crossings of the lines u = offset + 2 i, v = offset + 2 j (i, j whole) with triangles: u, v and w of each.
 
-    The side of an edge on which a line passes is computed once per edge, from its lower vertex, so the triangles
-    at an edge agree and no line slips between them or hits both.
+    A line's side of an edge is computed from the edge's lower vertex, so the triangles at an edge agree and no line
+    slips between them or hits both.
 
     Args:
         u: first coordinate of the vertices across the lines, in units of half the line spacing, shape (n_vertex,).
@@ -296,7 +284,7 @@ def line_hits(
 def _lines_over_triangles(
     u: FloatArray, v: FloatArray, triangles: Int64Array, offset: int
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Triangle, u and v of every line that passes through a triangle's bounding rectangle."""
+    """Triangle, u and v of each line through a triangle's bounding rectangle."""
     first_u, first_v = (np.ceil((x[triangles].min(axis=1) - offset) / 2).astype(np.int64) for x in (u, v))
     last_u, last_v = (np.floor((x[triangles].max(axis=1) - offset) / 2).astype(np.int64) for x in (u, v))
     wide, high = (last_u - first_u + 1).clip(min=0), (last_v - first_v + 1).clip(min=0)
@@ -309,11 +297,11 @@ def _lines_over_triangles(
 
 
 def triangle_lattice(splits: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """A triangle whose edges are split into `splits` parts each.
+    """Subdivision of a triangle with each edge in `splits` parts.
 
     Returns:
-        Its lattice points as three counts that sum up to `splits`, which are barycentric weights (n_point, 3), and the
-        small triangles between them, which turn as the large one does (splits^2, 3).
+        Lattice points as barycentric weights, three counts of sum `splits` (n_point, 3), and the small triangles
+        between them, in the order of the large one's corners (splits^2, 3).
     """
     index: dict[tuple[int, int], int] = {}
     for i in range(splits + 1):

@@ -1,4 +1,4 @@
-"""The tetrahedral mesh of an organ: points, tets, regions and their incidences."""
+"""Tetrahedral mesh of an organ: points, tets, regions and their incidences."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,21 +13,21 @@ from msdm_core.errors import MeshError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
+Int64Array = NDArray[np.int64]
 
 # Vertices of the face opposite each corner of a tet, ordered so that its normal points out of a positive tet.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int32)
 TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int32)
 
-# A tet whose volume is below this share of its longest edge cubed is flat (a regular tet has 0.118).
+# Smallest volume / longest edge^3 of a tet (0.118 in a regular one).
 DEGENERATE_VOLUME_RATIO = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class TetMesh:
-    """A connected body of tetrahedra, in metres, every tet with positive volume.
+    """A connected body of tetrahedra with positive volumes.
 
-    Tets given inside out are reoriented. Arrays are copied to contiguous
-    native float64 / int32 and made read-only.
+    Tets given inside out are reoriented. Arrays are copied to contiguous native float64 / int32 and made read-only.
 
     Args:
         points: node positions [m], shape (n_node, 3).
@@ -43,7 +43,7 @@ class TetMesh:
     tets: IntArray
     region: IntArray
     region_names: tuple[tuple[int, str], ...]
-    # The mesh that `moved` made this one from.
+    # The mesh before it was moved.
     origin: "TetMesh | None" = field(init=False, default=None)
 
     def __init__(
@@ -56,7 +56,7 @@ class TetMesh:
         point_array = _checked_points(points)
         tet_array = _checked_tets(tets, len(point_array))
         tet_array, _ = _oriented(point_array, tet_array)
-        _check_faces(tet_array)
+        _check_one_body(tet_array)
         pairs = region_names.items() if isinstance(region_names, dict) else region_names
         object.__setattr__(self, "points", _frozen(point_array))
         object.__setattr__(self, "tets", _frozen(tet_array))
@@ -77,7 +77,7 @@ class TetMesh:
         """The same tets with their nodes at other places [m], (n_node, 3); both have their springs in the same order.
 
         Raises:
-            MeshError: points of another number, or a tet that is turned inside out or flat (names it).
+            MeshError: another number of points, or a tet turned inside out or flat; names it.
         """
         array = _checked_points(points)
         if array.shape != self.points.shape:
@@ -93,7 +93,11 @@ class TetMesh:
         return other
 
     def region_tag(self, name: str) -> int:
-        """The tag of a named region; MeshError lists the names there are."""
+        """Tag of a named region.
+
+        Raises:
+            MeshError: no region of that name; lists those of the mesh.
+        """
         for tag, known in self.region_names:
             if known == name:
                 return tag
@@ -160,18 +164,76 @@ def tet_volumes(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     return dot(b - a, np.cross(c - a, d - a)) / 6.0
 
 
+def area_vectors(corners: FloatArray) -> FloatArray:
+    """Area vector of each triangle, (b - a) x (c - a) / 2 [m^2], of corners (..., 3, 3) [m], shape (..., 3)."""
+    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
+    return 0.5 * np.cross(b - a, c - a)
+
+
+def oriented_tets(points: FloatArray, tets: Int64Array) -> Int64Array:
+    """Tets with their last two corners exchanged where the volume is negative, shape (n_tet, 4)."""
+    return np.where((tet_volumes(points, tets) < 0)[:, None], tets[:, [0, 1, 3, 2]], tets)
+
+
+def connected_parts(first: NDArray[np.integer], second: NDArray[np.integer], count: int) -> tuple[int, IntArray]:
+    """Number of connected parts of `count` items, joined by pairs (first[i], second[i]), and each item's part."""
+    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)
+
+
+def connected_tets(tets: NDArray[np.integer]) -> tuple[int, IntArray]:
+    """Number of parts connected through faces, and the part of each tet, shape (n_tet,).
+
+    Raises:
+        MeshError: a face of more than two tets; names it.
+    """
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    same = (np.diff(faces[order], axis=0) == 0).all(axis=1)
+    crowded = np.flatnonzero(same[1:] & same[:-1])
+    if crowded.size:
+        tet = int(order[crowded[0]] // 4)
+        raise MeshError(
+            f"face {faces[order[crowded[0]]].tolist()} of tet {tet} is shared by more than 2 tets: "
+            "remove the overlapping ones"
+        )
+    twins = np.flatnonzero(same)
+    return connected_parts(order[twins] // 4, order[twins + 1] // 4, len(tets))
+
+
+def part_sizes(part: IntArray) -> str:
+    """Sizes of the six largest of several parts, for a message."""
+    sizes = np.sort(np.bincount(part))[::-1]
+    return ", ".join(map(str, sizes[:6])) + (", ..." if len(sizes) > 6 else "")
+
+
 def _frozen(array: NDArray) -> NDArray:
     array.setflags(write=False)
     return array
 
 
-def _checked_points(points: ArrayLike) -> FloatArray:
-    array = np.array(points, dtype=np.float64, order="C")
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+def check_finite(points: FloatArray, noun: str) -> None:
+    """Refuse points (n, 3) with a coordinate that is not finite; `noun` names them in the message."""
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise MeshError(
-            f"node {bad[0]} is at {array[bad[0]].tolist()}; every coordinate must be finite: repair the file"
+            f"{noun} {bad[0]} is at {points[bad[0]].tolist()}; every coordinate must be finite: repair the file"
         )
+
+
+def check_indices(items: NDArray, point_count: int, item_noun: str, point_noun: str) -> None:
+    """Refuse items (n, k) with a point index out of range; the nouns name both in the message."""
+    outside = np.flatnonzero(((items < 0) | (items >= point_count)).any(axis=1))
+    if outside.size:
+        raise MeshError(
+            f"{item_noun} {outside[0]} uses {point_noun} {items[outside[0]].tolist()}; "
+            f"indices must lie in 0..{point_count - 1}"
+        )
+
+
+def _checked_points(points: ArrayLike) -> FloatArray:
+    array = np.array(points, dtype=np.float64, order="C")
+    check_finite(array, "node")
     order = np.lexsort(array.T)
     twins = np.flatnonzero((np.diff(array[order], axis=0) == 0).all(axis=1))
     if twins.size:
@@ -184,15 +246,11 @@ def _checked_points(points: ArrayLike) -> FloatArray:
 
 
 def _checked_tets(tets: ArrayLike, node_count: int) -> IntArray:
-    given = np.asarray(tets)
-    if given.size == 0:
+    indices = np.asarray(tets)
+    if indices.size == 0:
         raise MeshError("the mesh has no tets; an organ needs at least one: mesh the volume first (mesh_surface)")
-    outside = np.flatnonzero(((given < 0) | (given >= node_count)).any(axis=1))
-    if outside.size:
-        raise MeshError(
-            f"tet {outside[0]} uses nodes {given[outside[0]].tolist()}; indices must lie in 0..{node_count - 1}"
-        )
-    array = np.array(given, dtype=np.int32, order="C")
+    check_indices(indices, node_count, "tet", "nodes")
+    array = np.array(indices, dtype=np.int32, order="C")
     unused = np.flatnonzero(np.bincount(array.ravel(), minlength=node_count) == 0)
     if unused.size:
         raise MeshError(
@@ -220,29 +278,12 @@ def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
     return tets, int(negative.sum())
 
 
-def _check_faces(tets: IntArray) -> None:
-    """Refuse crowded faces, and parts that meet only in nodes or edges.
-
-    Springs at a single node or edge resist no bending: such parts are joined by hinges.
-    """
-    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = (np.diff(faces[order], axis=0) == 0).all(axis=1)
-    crowded = np.flatnonzero(same[1:] & same[:-1])
-    if crowded.size:
-        tet = int(order[crowded[0]] // 4)
-        raise MeshError(
-            f"face {faces[order[crowded[0]]].tolist()} of tet {tet} is shared by more than 2 tets: "
-            "remove the overlapping ones"
-        )
-    twins = np.flatnonzero(same)
-    pairs = order[twins] // 4, order[twins + 1] // 4
-    graph = coo_array((np.ones(len(twins), dtype=np.int8), pairs), shape=(len(tets), len(tets)))
-    count, part = connected_components(graph, directed=False)
+def _check_one_body(tets: IntArray) -> None:
+    # Springs at a single node or edge resist no bending: parts that meet there alone are joined by hinges.
+    count, part = connected_tets(tets)
     if count > 1:
-        sizes = ", ".join(map(str, np.sort(np.bincount(part))[::-1][:6])) + (", ..." if count > 6 else "")
         raise MeshError(
-            f"the mesh falls into {count} disconnected parts, which share no face, of {sizes} tets; "
+            f"the mesh falls into {count} disconnected parts, which share no face, of {part_sizes(part)} tets; "
             "an organ is one body, and parts that meet in a node or an edge hang on a hinge: remesh, or keep one part"
         )
 

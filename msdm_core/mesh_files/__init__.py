@@ -1,4 +1,4 @@
-"""Reading and writing meshes and surfaces."""
+"""Files of tetrahedral meshes and surfaces."""
 
 from msdm_core.mesh_files.mesh_file import LengthUnit, parsed
 from msdm_core.mesh_files.mesh_io import FORMATS, WRITTEN_SUFFIX, read_mesh, write_mesh

@@ -1,4 +1,4 @@
-"""Checks of every mesh or surface file: its suffix, a parser that may neither exit nor print, its unit of length."""
+"""Common parts of mesh and surface files: suffix, guarded parser, unit of length, extent."""
 
 import contextlib
 import io
@@ -16,7 +16,7 @@ LengthUnit = str | float
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
-# The longest side of an organ's bounding box [m]; outside it, the unit is wrong far more often than the organ.
+# Longest side of an organ's bounding box [m]; beyond, the unit is wrong far more often than the organ.
 SMALLEST_EXTENT = 1e-3
 LARGEST_EXTENT = 2.0
 
@@ -24,10 +24,10 @@ Parsed = TypeVar("Parsed")
 
 
 def checked_file(path: str | Path, suffixes: Iterable[str], advice: str) -> Path:
-    """The path of a file with one of the suffixes.
+    """Path of an existing file with one of the suffixes.
 
     Raises:
-        MeshError: names the path, what is wrong with it and, for an unknown suffix, those there are.
+        MeshError: no such file, or an unknown suffix; names the path and the known suffixes.
     """
     file = Path(path)
     if not file.is_file():
@@ -39,24 +39,24 @@ def checked_file(path: str | Path, suffixes: Iterable[str], advice: str) -> Path
 
 
 def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:
-    """What `parse` makes of the file, its exits, prints and errors of any type turned into one MeshError.
+    """Result of `parse`, with exits, prints and errors of any type turned into one MeshError.
 
-    A number that does not fit its type is an error, too: numpy would make another one of it, with a warning.
+    A number beyond the range of its type is an error, too: numpy would change it, with a warning.
 
     Raises:
-        MeshError: names the file and the parser's own reason; one that `parse` raises is passed on.
+        MeshError: names the file and the parser's own reason; a MeshError of `parse` is passed on.
     """
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             with np.errstate(over="raise", invalid="raise"):
                 return parse(str(file))
     except MeshError:
         raise
-    # A parser that meets a malformed file raises anything from KeyError to zlib.error, or SystemExit (meshio).
+    # Malformed files raise anything from KeyError to zlib.error, or SystemExit (meshio).
     except (Exception, SystemExit) as error:
-        reasons = [said.getvalue(), f"{type(error).__name__} {error}"]
-        reason = "; ".join(" ".join(one.split()) for one in reasons if one.strip())
+        reasons = [output.getvalue(), f"{type(error).__name__} {error}"]
+        reason = "; ".join(" ".join(text.split()) for text in reasons if text.strip())
         raise MeshError(f"{file}: cannot be parsed: {reason}: {advice}") from error
 
 
@@ -64,7 +64,7 @@ def metres_per_unit(length_unit: LengthUnit) -> float:
     """Metres per file unit, from "m", "cm", "mm" or a positive number of metres [m].
 
     Raises:
-        ValueError: names the unit and the units there are.
+        ValueError: names the unit and the known units.
     """
     if isinstance(length_unit, str):
         if length_unit in METRES_PER_UNIT:
@@ -78,10 +78,10 @@ def metres_per_unit(length_unit: LengthUnit) -> float:
 
 
 def check_extent(points: NDArray[np.float64], metres: float, path: Path) -> None:
-    """Refuse a body whose longest side [m] no organ has, points [m], shape (n_node, 3), read at `metres` per unit.
+    """Refuse points (n_node, 3) [m], read at `metres` per unit, with an extent of no organ.
 
     Raises:
-        MeshError: names the extent, the rule and the units that would fit.
+        MeshError: names the extent, the rule and fitting units.
     """
     extent = float(np.ptp(points, axis=0).max())
     if SMALLEST_EXTENT <= extent <= LARGEST_EXTENT:

@@ -1,4 +1,4 @@
-"""Reading tetrahedral meshes (vtu, legacy vtk, gmsh, medit) and writing them as vtu; surfaces are in surface_io.
+"""Tetrahedral mesh files: vtu, legacy vtk, gmsh and medit read, vtu written.
 
 A vtu file has no field for the length unit or for region names. The FieldData arrays "length_unit_m" and "region/NAME"
 (percent-coded, value = tag) hold them; other readers skip these arrays, and VTK and ParaView keep them.
@@ -32,24 +32,24 @@ _REGION_KEY = "region/"
 
 
 def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None) -> TetMesh:
-    """The tetrahedral mesh of a vtu, vtk, gmsh (2.2, 4.1) or medit file, in metres.
+    """Tetrahedral mesh of a vtu, vtk, gmsh (2.2, 4.1) or medit file, in metres.
 
     Args:
-        path: the file; its suffix (.vtu, .vtk, .msh, .mesh) says the format.
-        length_unit: "m", "cm", "mm" or metres per unit. May be left out only for files that `write_mesh` wrote,
-            which state it; when given it wins, with a warning if the file states another.
+        path: the file, its format by suffix (.vtu, .vtk, .msh, .mesh).
+        length_unit: "m", "cm", "mm" or metres per unit. May be left out only for files of `write_mesh`, which state it;
+            if given it wins, with a warning if the file states another.
 
     Raises:
         ValueError: names an unknown length unit.
         MeshError: names the file and the fault: missing, not parsable, no unit, no or curved tets, an unlikely extent,
-            parts that share no face, or the first node or tet that TetMesh refuses.
+            parts without a common face, or the first node or tet refused by TetMesh.
     """
     asked = None if length_unit is None else metres_per_unit(length_unit)
     file = checked_file(path, FORMATS, _CONVERT)
     if file.suffix.lower() == ".vtu":
         _check_pieces(file)
     raw = parsed(file, _reader(FORMATS[file.suffix.lower()]), _CONVERT)
-    metres = _chosen_unit(file, asked, _stated_unit(raw))
+    metres = _chosen_unit(file, asked, float(raw.field_data[UNIT_KEY].flat[0]) if UNIT_KEY in raw.field_data else None)
     tets = _only_tets(file, raw)
     try:
         mesh = TetMesh(np.asarray(raw.points, dtype=np.float64) * metres, tets, _region_of(raw), _region_names(raw))
@@ -60,7 +60,7 @@ def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None) -> Tet
 
 
 def write_mesh(path: str | Path, mesh: TetMesh) -> None:
-    """Write a mesh in metres as vtu, with its regions and their names, so that `read_mesh` gives it back to the bit.
+    """Write a mesh in metres as vtu, with its regions and their names; `read_mesh` returns it to the bit.
 
     Raises:
         ValueError: a suffix other than .vtu.
@@ -69,18 +69,18 @@ def write_mesh(path: str | Path, mesh: TetMesh) -> None:
 
     file = Path(path)
     if file.suffix.lower() != WRITTEN_SUFFIX:
-        raise ValueError(f"{file}: meshes are written as {WRITTEN_SUFFIX}; meshio convert makes other formats of it")
+        raise ValueError(f"{file}: the suffix must be {WRITTEN_SUFFIX}; meshio convert makes other formats of it")
     cell_data: dict[str, list[ArrayLike]] = {"region": [np.array(mesh.region, dtype=np.int64)]}
     out = meshio.Mesh(mesh.points, [("tetra", np.array(mesh.tets))], cell_data=cell_data)
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder) / "mesh"
         meshio.vtu.write(str(scratch), out)
-        head, mark, rest = scratch.read_bytes().partition(b"<UnstructuredGrid>")
-    file.write_bytes(head + mark + _field_data(mesh) + rest)
+        head, mark, tail = scratch.read_bytes().partition(b"<UnstructuredGrid>")
+    file.write_bytes(head + mark + _field_data(mesh) + tail)
 
 
 def _reader(file_format: str) -> Callable[[str], Any]:
-    """The format's own meshio reader: meshio.read prints and calls sys.exit when one of these raises."""
+    """The format's own meshio reader; meshio.read would print and call sys.exit on an error."""
     import meshio
 
     return getattr(meshio, file_format).read
@@ -90,15 +90,11 @@ def _check_pieces(file: Path) -> None:
     pieces = len(re.findall(rb"<Piece\b", file.read_bytes()))
     if pieces > 1:
         # meshio 5.3.5 keeps only the cells of the last piece, without a warning.
-        raise MeshError(f"{file}: holds {pieces} pieces; one is the rule: merge them (ParaView: Merge Blocks)")
-
-
-def _stated_unit(raw: Any) -> float | None:
-    return float(raw.field_data[UNIT_KEY].flat[0]) if UNIT_KEY in raw.field_data else None
+        raise MeshError(f"{file}: holds {pieces} pieces; the rule is 1: merge them (ParaView: Merge Blocks)")
 
 
 def _chosen_unit(file: Path, asked: float | None, stated: float | None) -> float:
-    """Metres per file unit, from what the caller asked and the file states."""
+    """Metres per file unit, by the caller or else by the file."""
     if asked is None:
         if stated is None:
             raise MeshError(
@@ -113,7 +109,7 @@ def _chosen_unit(file: Path, asked: float | None, stated: float | None) -> float
 
 
 def _region_names(raw: Any) -> tuple[tuple[int, str], ...]:
-    """The (tag, name) pairs of a vtu file, or of a gmsh file, whose names meshio maps to (tag, dimension)."""
+    """Pairs (tag, name) of a vtu file, or of a gmsh file (there meshio maps names to (tag, dimension))."""
     names = []
     for key, value in raw.field_data.items():
         if key.startswith(_REGION_KEY):
@@ -124,26 +120,26 @@ def _region_names(raw: Any) -> tuple[tuple[int, str], ...]:
 
 
 def _only_tets(file: Path, raw: Any) -> NDArray[np.integer]:
-    """The tets of every block in file order, shape (n_tet, 4)."""
+    """Tets of all blocks in file order, shape (n_tet, 4)."""
     counts: dict[str, int] = {}
     for block in raw.cells:
         counts[block.type] = counts.get(block.type, 0) + len(block.data)
-    there = ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no cells at all"
+    cells = ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no cells at all"
     if any(kind != "tetra" and name in kind.lower() for kind in counts for name in _VOLUME_CELLS):
         raise MeshError(
-            f"{file}: has volume cells that are not linear tets of 4 nodes ({there}): mesh it anew with tets of order 1"
+            f"{file}: has volume cells that are not linear tets of 4 nodes ({cells}): mesh it anew with tets of order 1"
         )
     if "tetra" not in counts:
         raise MeshError(
-            f"{file}: has no tets ({there}): save a surface as STL, OBJ or PLY, which is filled with tets (ParaView: "
+            f"{file}: has no tets ({cells}): save a surface as STL, OBJ or PLY, which is filled with tets (ParaView: "
             "Extract Surface, Triangulate, Save Data; or meshio convert IN OUT.stl)"
         )
     return np.concatenate([np.asarray(block.data) for block in raw.cells if block.type == "tetra"])
 
 
 def _region_of(raw: Any) -> NDArray | None:
-    """Region tag of each tet in file order, shape (n_tet,); None when the file has none."""
-    key = next((one for one in REGION_KEYS if one in raw.cell_data), None)
+    """Region tag of each tet in file order, shape (n_tet,); None if the file has no tags."""
+    key = next((key for key in REGION_KEYS if key in raw.cell_data), None)
     if key is None:
         return None
     blocks = zip(raw.cells, raw.cell_data[key], strict=True)

@@ -1,4 +1,4 @@
-"""Reading the surface of an organ from STL, OBJ and PLY files."""
+"""Surface files: STL, OBJ and PLY read."""
 
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh.surface import merge_vertices
+from msdm_core.mesh.tet_mesh import check_indices
 from msdm_core.mesh_files.mesh_file import LengthUnit, check_extent, checked_file, metres_per_unit, parsed
 
 SURFACE_SUFFIXES = (".obj", ".ply", ".stl")
@@ -16,9 +17,9 @@ SURFACE_SUFFIXES = (".obj", ".ply", ".stl")
 def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Vertices [m], shape (n_vertex, 3), and triangles, shape (n_triangle, 3), of an STL, OBJ or PLY file.
 
-    `length_unit` is "m", "cm", "mm" or metres per unit: none of the formats states one. Vertices at exactly the same
-    place become one (STL repeats them per triangle, OBJ along texture seams); triangles that then use a vertex twice
-    have no area and are left out, and so are vertices that no triangle uses.
+    `length_unit` is "m", "cm", "mm" or metres per unit: none of the formats states it. Exactly coinciding vertices are
+    merged (STL repeats them per triangle, OBJ along texture seams); triangles that then use a vertex twice have no area
+    and are left out, and so are unused vertices.
 
     Raises:
         ValueError: names an unknown length unit.
@@ -29,15 +30,10 @@ def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[
     points, faces = parsed(file, _loaded, "export it again as STL, OBJ or PLY")
     if len(faces) == 0:
         raise MeshError(f"{file}: has no triangles ({len(points)} vertices); export a triangulated surface")
-    # trimesh cuts every vertex of an OBJ file to the shortest line.
+    # trimesh cuts the vertices of an OBJ file to the shortest line.
     if points.shape[1] != 3:
-        raise MeshError(f"{file}: a vertex has {points.shape[1]} coordinates; 3 are the rule: export the surface again")
-    outside = np.flatnonzero(((faces < 0) | (faces >= len(points))).any(axis=1))
-    if outside.size:
-        raise MeshError(
-            f"{file}: triangle {outside[0]} uses vertices {faces[outside[0]].tolist()}; "
-            f"indices must lie in 0..{len(points) - 1}: export it again"
-        )
+        raise MeshError(f"{file}: a vertex has {points.shape[1]} coordinates; the rule is 3: export the surface again")
+    check_indices(faces, len(points), f"{file}: triangle", "vertices")
     vertices, triangles = _merged(points, faces)
     if len(triangles) == 0:
         raise MeshError(f"{file}: every triangle uses a vertex twice, so none has an area; export the surface again")
@@ -47,7 +43,7 @@ def read_surface(path: str | Path, *, length_unit: LengthUnit) -> tuple[NDArray[
 
 
 def _loaded(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and triangles of a file, every object in it taken together."""
+    """Vertices and triangles of all objects in a file."""
     import trimesh
 
     # Merging is ours (exact, trimesh rounds); materials would open further files.
@@ -59,7 +55,7 @@ def _loaded(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _merged(points: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Points with exact twins and unused ones gone, otherwise in their order, and the triangles renumbered."""
+    """Points without exact twins and unused points, and the renumbered triangles."""
     vertices, triangles = merge_vertices(points, faces)
     flat = (np.diff(np.sort(triangles, axis=1), axis=1) == 0).any(axis=1)
     if flat.any():

@@ -1,4 +1,4 @@
-"""Making tetrahedral meshes from blocks, surfaces and label images."""
+"""Tetrahedral meshes of blocks, surfaces and label images."""
 
 from msdm_core.meshing.lattice_meshing import box_mesh, largest_body_mesh, mesh_surface
 from msdm_core.meshing.segmentation_meshing import (

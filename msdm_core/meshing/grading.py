@@ -1,11 +1,10 @@
-"""A body filled with a graded lattice: fine cells at chosen triangles, 2 or 4 times as long ones elsewhere.
+"""Graded lattices: fine cells at chosen triangles, cells 2 or 4 times as long elsewhere.
 
 The lattice is a weakly balanced octree of cells, filled with tets (Labelle and Shewchuk 2007); a leaf of level l is a
-cube of 2^l fine cells along each edge. Grid coordinates count half FINE cells, as in `msdm_core.meshing.stuffing`,
-whose cuts at the surface are used: every leaf corner and centre is then a grid point, all even or (centres of fine
-leaves) all odd. Where large and small cells meet at the surface no bound on the angles is published (Labelle and
-Shewchuk keep the whole surface in leaves of one size): the angles are measured, and where one is too small the cells
-around it are made fine.
+cube of 2^l fine cells along each edge. Grid coordinates count half FINE cells, as in `msdm_core.meshing.stuffing`:
+leaf corners and centres are then grid points, all even or (centres of fine leaves) all odd. Labelle and Shewchuk keep
+the whole surface in leaves of one size; no bound on the angles is published for a surface that crosses leaves of
+several sizes. The angles are therefore measured, and the cells around too small an angle are made fine.
 """
 
 from itertools import product
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import tet_angles
-from msdm_core.mesh.surface import Int64Array
-from msdm_core.mesh.tet_mesh import TET_EDGES, TET_FACES, FloatArray, tet_volumes
+from msdm_core.mesh.tet_mesh import TET_EDGES, TET_FACES, FloatArray, Int64Array, oriented_tets
 from msdm_core.meshing.stuffing import (
     ALPHA_LONG,
     ALPHA_SHORT,
@@ -30,20 +28,20 @@ from msdm_core.meshing.stuffing import (
 
 COARSENINGS = (1, 2, 4)  # largest / smallest cell edge of a lattice, per level of the largest
 
-# Share of an edge within which a node of any but a BCC tet moves onto the surface. On 16 bumpy bodies with randomly
-# scattered leaf sizes 0.30 kept every angle above 10 degrees, 0.35 above 5, 0.38 above 2.
+# Nodes of other than BCC tets move onto a surface within this share of an edge. On 16 bumpy bodies with randomly
+# scattered leaf sizes 0.30 kept all angles above 10 degrees, 0.35 above 5, 0.38 above 2.
 ALPHA_TRANSITION = 0.30
-# Smallest dihedral angle that is accepted [degrees]. BCC tets alone have at least 9.3, so finer cells help.
+# Smallest accepted dihedral angle [degrees]. BCC tets alone have at least 9.3, so finer cells help.
 ANGLE_SMALLEST = 9.0
 SAMPLES_PER_CELL = 4  # points on chosen triangles, per cell edge
 
-# Steps to the cells with which a cell shares a face or an edge (weak balance), but not only a corner.
+# Steps to the neighbours of a cell through faces and edges (weak balance), without those through corners.
 BESIDE = np.array([step for step in product((-1, 0, 1), repeat=3) if 1 <= np.abs(step).sum() <= 2])
 RING = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # corners of a face, in turn
 
 
 def coarsest_level(size: float, coarse_cell_size: float) -> int:
-    """The level of the largest cells: 0 for cells of one size, 1 or 2."""
+    """Level of the largest cells: 0 for cells of one size, 1 or 2."""
     ratio = coarse_cell_size / size
     for level, coarsening in enumerate(COARSENINGS):
         if abs(ratio - coarsening) <= 1e-9 * coarsening:
@@ -60,18 +58,18 @@ def stuff_graded(
     """Fill a body with tets: points (n_node, 3) [m] and tets (n_tet, 4), not oriented.
 
     Args:
-        body: a closed surface's or a level set's.
-        fine: corners of the triangles at which cells are fine [m], shape (n_fine, 3, 3).
+        body: inside of a closed surface or level set.
+        fine: corners of the triangles surrounded by fine cells [m], shape (n_fine, 3, 3).
         cell_size: edge of the fine cells [m].
-        fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
-        coarsest: the largest cells have an edge of 2^coarsest fine cells.
+        fine_depth: cells within this distance of such a triangle along each axis are fine [m].
+        coarsest: level of the largest cells, with an edge of 2^coarsest fine cells.
     """
     from scipy.ndimage import maximum_filter
 
     lattice = lattice_around(body.box, cell_size, 2**coarsest)
     permitted = _permitted_levels(fine, lattice, fine_depth, coarsest)
     inside = body.signs(lattice) > 0
-    lattice, permitted = _laid_out(lattice, permitted, inside.reshape(lattice.shape))
+    lattice, permitted = _shifted(lattice, permitted, inside.reshape(lattice.shape))
     sign = body.signs(lattice)
     reach = 0
     while True:
@@ -88,7 +86,7 @@ def stuff_graded(
 
 
 def _permitted_levels(corners: FloatArray, lattice: Lattice, fine_depth: float, coarsest: int) -> Int64Array:
-    """0 at the cells that come within a depth [m] of triangles (n, 3, 3), the coarsest level elsewhere."""
+    """Level 0 at cells within a depth [m] of triangles (n, 3, 3), the coarsest level elsewhere."""
     from scipy.spatial import KDTree
 
     shape = np.array(lattice.shape) // 2
@@ -104,15 +102,15 @@ def _points_on(corners: FloatArray, spacing: float) -> FloatArray:
     """Points on triangles (n, 3, 3), along each side no farther apart than a spacing [m], shape (n_point, 3)."""
     longest = norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.ceil(longest / spacing).astype(np.int64)
-    found = []
+    points = []
     for count in np.unique(counts).tolist():
         weights = np.array([(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]) / count
-        found.append(matmul(weights, corners[counts == count]).reshape(-1, 3))
-    return np.concatenate(found)
+        points.append(matmul(weights, corners[counts == count]).reshape(-1, 3))
+    return np.concatenate(points)
 
 
-def _laid_out(lattice: Lattice, permitted: Int64Array, inside: NDArray[np.bool_]) -> tuple[Lattice, Int64Array]:
-    """The lattice and the permitted levels, shifted by whole fine cells so that the fewest nodes lie inside."""
+def _shifted(lattice: Lattice, permitted: Int64Array, inside: NDArray[np.bool_]) -> tuple[Lattice, Int64Array]:
+    """The lattice and the permitted levels, shifted by whole fine cells for the fewest nodes inside."""
     width = 2 ** int(permitted.max())
     best, least = (0, 0, 0), np.inf
     # No wrap-around: the surface keeps more than `width` cells from the grid's sides.
@@ -133,7 +131,7 @@ def _fill(body: Body, sign: NDArray[np.int8], lattice: Lattice, level: Int64Arra
 
 
 def _edge_cuts(background: Int64Array, sign: NDArray[np.int8], body: Body, lattice: Lattice) -> tuple[Cuts, FloatArray]:
-    """The cuts of the edges whose ends lie on different sides, and the share of each within which a node moves."""
+    """Cuts of the edges between inside and outside, and the share of each for `fill_background`."""
     ends = np.sort(background[:, TET_EDGES], axis=2)
     keys = ends[..., 0] * sign.size + ends[..., 1]
     is_cut = sign[ends[..., 0]] * sign[ends[..., 1]] < 0
@@ -141,22 +139,21 @@ def _edge_cuts(background: Int64Array, sign: NDArray[np.int8], body: Body, latti
     node, other = cut_keys // sign.size, cut_keys % sign.size
     step = lattice.coordinates(other) - lattice.coordinates(node)
     fraction = np.empty(len(node))
-    directions, which = np.unique(np.sign(step), axis=0, return_inverse=True)
+    directions, direction = np.unique(np.sign(step), axis=0, return_inverse=True)
     for k in range(len(directions)):
-        chosen = which.ravel() == k
+        chosen = direction.ravel() == k
         fraction[chosen] = body.fractions(step[chosen], node[chosen], sign, lattice)
     is_long = (step != 0).sum(axis=1) == 1
     diagonal_count = (lattice.coordinates(ends[..., 0]) != lattice.coordinates(ends[..., 1])).all(axis=2).sum(axis=1)
-    is_bcc = diagonal_count == 4
-    at_transition = np.isin(cut_keys, keys[~is_bcc])
+    # A BCC tet has four diagonal edges.
+    at_transition = np.isin(cut_keys, keys[diagonal_count != 4])
     limit = np.where(at_transition, ALPHA_TRANSITION, np.where(is_long, ALPHA_LONG, ALPHA_SHORT))
     return Cuts(node, other, fraction, is_long), limit
 
 
 def _poor_tets(points: FloatArray, tets: Int64Array) -> NDArray[np.bool_]:
     """Tets with too small an angle, or folded: on the same side of a face as their neighbour, shape (n_tet,)."""
-    negative = tet_volumes(points, tets) < 0
-    tets = np.where(negative[:, None], tets[:, [0, 1, 3, 2]], tets)
+    tets = oriented_tets(points, tets)
     with np.errstate(divide="ignore", invalid="ignore"):
         fits = tet_angles(points, tets).min(axis=1) >= ANGLE_SMALLEST
     faces = tets[:, TET_FACES].reshape(-1, 3)
@@ -170,13 +167,13 @@ def _poor_tets(points: FloatArray, tets: Int64Array) -> NDArray[np.bool_]:
 
 
 def balanced_levels(permitted: Int64Array) -> Int64Array:
-    """Level of the leaf around each fine cell: the largest leaves that weak balance and a permission per cell allow.
+    """Level of the leaf around each fine cell, in the octree of the largest permitted leaves.
 
-    A leaf exceeds the permission of none of its cells, nor, by more than one, the level of a leaf with which it
-    shares a face or a part of an edge.
+    A leaf exceeds the permission of none of its cells, nor, by more than one, the level of a neighbour through a face
+    or a part of an edge (weak balance).
 
     Args:
-        permitted: largest level wanted at each fine cell, shape (nx, ny, nz), multiples of 2^(largest level).
+        permitted: largest level at each fine cell, shape (nx, ny, nz), multiples of 2^(largest level).
     """
     while True:
         level = _largest_leaves(permitted)
@@ -192,37 +189,37 @@ def balanced_levels(permitted: Int64Array) -> Int64Array:
 
 def _largest_leaves(permitted: Int64Array) -> Int64Array:
     level = np.zeros(permitted.shape, dtype=np.int64)
-    for wanted in range(1, int(permitted.max()) + 1):
-        width = 2**wanted
+    for size in range(1, int(permitted.max()) + 1):
+        width = 2**size
         nx, ny, nz = (n // width for n in permitted.shape)
-        whole = permitted.reshape(nx, width, ny, width, nz, width).min(axis=(1, 3, 5)) >= wanted
-        level[np.kron(whole, np.ones((width, width, width), dtype=bool))] = wanted
+        whole = permitted.reshape(nx, width, ny, width, nz, width).min(axis=(1, 3, 5)) >= size
+        level[np.kron(whole, np.ones((width, width, width), dtype=bool))] = size
     return level
 
 
 def octree_tets(level: Int64Array) -> Int64Array:
-    """Tets that fill a balanced octree, as grid points numbered row by row, not oriented, shape (n_tet, 4).
+    """Tets of a balanced octree, as grid points numbered row by row, not oriented, shape (n_tet, 4).
 
-    Between leaves of one size lie BCC tets (two centres and an edge of the face), cut in two where smaller leaves
-    have a corner on that edge; a large leaf meets four small ones in eight quarters of a BCC tet at the centre of
-    its face, and the small ones meet it in half pyramids, as they do the outside. An outer face with a corner on one
-    of its edges is cut from its centre.
+    Between leaves of one size lie BCC tets (two centres and an edge of the face), cut in two by a corner of smaller
+    leaves on that edge. A large leaf meets four small ones in eight quarters of a BCC tet around the centre of its
+    face; the small ones meet it in half pyramids, as they do the outside. An outer face with a corner on an edge is
+    cut from its centre.
 
     Args:
         level: from `balanced_levels`, shape (nx, ny, nz).
     """
     is_node = octree_nodes(level)
-    found = []
+    tets = []
     for size in range(int(level.max()) + 1):
         centre = _leaf_centres(level, size)
         for axis, sign in product(range(3), (-1, 1)):
-            found += _face_tets(centre, size, axis, sign, level, is_node)
-    places = np.concatenate(found)
-    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(places, -1, 0)), is_node.shape), dtype=np.int64)
+            tets += _face_tets(centre, size, axis, sign, level, is_node)
+    places = np.moveaxis(np.concatenate(tets), -1, 0)
+    return np.asarray(np.ravel_multi_index(tuple(places), is_node.shape), dtype=np.int64)
 
 
 def octree_nodes(level: Int64Array) -> NDArray[np.bool_]:
-    """Which grid points are corners or centres of leaves, shape (2 nx + 1, 2 ny + 1, 2 nz + 1)."""
+    """Corners and centres of leaves among the grid points, shape (2 nx + 1, 2 ny + 1, 2 nz + 1)."""
     is_node = np.zeros([2 * n + 1 for n in level.shape], dtype=bool)
     for size in range(int(level.max()) + 1):
         centre = _leaf_centres(level, size)
@@ -242,7 +239,11 @@ def _face_tets(
 ) -> list[Int64Array]:
     """Grid coordinates of the tets of leaves of one level at their faces on one side, each (n, 4, 3)."""
     half = 2**size
-    outward, ring = _face_frame(half, axis, sign)
+    # Steps from the centre to that of the face, and to the face's corners in turn.
+    outward = np.zeros(3, dtype=np.int64)
+    outward[axis] = sign * half
+    ring = np.tile(outward, (4, 1))
+    ring[:, [(axis + 1) % 3, (axis + 2) % 3]] = half * RING
     beyond = (centre + outward) // 2
     beyond[:, axis] += 0 if sign > 0 else -1
     outside = (beyond[:, axis] < 0) | (beyond[:, axis] >= level.shape[axis])
@@ -265,24 +266,14 @@ def _face_tets(
     return tets
 
 
-def _face_frame(half: int, axis: int, sign: int) -> tuple[Int64Array, Int64Array]:
-    """Steps from a leaf's centre to the centre of a face, (3,), and to the corners of the face in turn, (4, 3)."""
-    outward = np.zeros(3, dtype=np.int64)
-    outward[axis] = sign * half
-    ring = np.tile(outward, (4, 1))
-    ring[:, [(axis + 1) % 3, (axis + 2) % 3]] = half * RING
-    return outward, ring
-
-
 def _half_pyramids(centre: Int64Array, ring: Int64Array, half: int) -> Int64Array:
-    """Two tets per leaf on one face, cut along the diagonal that meets the centre of a twice as large neighbour's face.
+    """Two tets per leaf on one face, cut along the diagonal through the centre of a twice as large neighbour's face.
 
     Of the four corners, counted in leaf widths, that centre is odd along both directions of the face and its
     opposite even along both; on outer faces the same rule alternates like a checkerboard.
     """
     varying = np.flatnonzero(np.ptp(ring, axis=0))
     odd = ((centre + ring[0])[:, varying] // (2 * half)).sum(axis=1) % 2
-    turned = ring[(np.arange(4) + odd[:, None]) % 4]
     apex = centre[:, None]
-    corners = apex + turned
+    corners = apex + ring[(np.arange(4) + odd[:, None]) % 4]
     return np.concatenate([np.concatenate([apex, corners[:, pick]], axis=1) for pick in ([0, 1, 2], [0, 2, 3])])

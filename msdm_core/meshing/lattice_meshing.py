@@ -1,4 +1,4 @@
-"""Meshes of body-centred cubic (BCC) lattices, on which formula (6) is isotropic: blocks and filled surfaces.
+"""Blocks and filled surfaces on body-centred cubic (BCC) lattices, where the springs of formula (6) are isotropic.
 
 Both can be graded: fine where the tissue is felt, with cells 2 or 4 times as long elsewhere
 (`msdm_core.meshing.grading`). At the seams between cell sizes formula (6) is not isotropic.
@@ -8,21 +8,13 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from msdm_core.arithmetic import cbrt
 from msdm_core.errors import MeshError
 from msdm_core.mesh.ordering import swept
-from msdm_core.mesh.surface import Int64Array, check_surface, surface_volume
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, TetMesh, tet_volumes
-from msdm_core.meshing.grading import (
-    COARSENINGS,
-    balanced_levels,
-    coarsest_level,
-    octree_tets,
-    stuff_graded,
-)
+from msdm_core.mesh.surface import check_surface, surface_volume
+from msdm_core.mesh.tet_mesh import FloatArray, Int64Array, TetMesh, connected_tets, oriented_tets, tet_volumes
+from msdm_core.meshing.grading import COARSENINGS, balanced_levels, coarsest_level, octree_tets, stuff_graded
 from msdm_core.meshing.stuffing import SurfaceBody, lattice_around, stuff
 
 STRETCH_LIMIT = 1.01  # longest / shortest cell edge up to which a lattice counts as cubic
@@ -36,20 +28,20 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
     Nodes are the corners and then the centres of the cells. Each inner cell face gives four tets (two centres and
-    an edge of the face); each outer face is cut along a diagonal that alternates like a checkerboard, so that the
-    block prefers no direction.
+    an edge of the face). The diagonals of outer faces alternate like a checkerboard, so that the block prefers no
+    direction.
 
     Args:
         size: edge lengths [m], shape (3,).
         cells: whole numbers of cells along each axis, shape (3,).
-        coarsening: largest cell edge in fine ones, 1 (all cells alike), 2 or 4; divides each number of cells.
-        fine_depth: where cells may coarsen, the depth below the top face z = sz that is filled with fine cells [m].
+        coarsening: largest cell edge over the smallest, 1 (cells of one size), 2 or 4; divides each number of cells.
+        fine_depth: depth of the fine cells of a graded block below the top face z = sz [m].
 
     Warns:
-        UserWarning: names the stretch where cells are more than 1 % from cubes: formula (6) is then not isotropic.
+        UserWarning: cells more than 1 % from cubes: formula (6) is then not isotropic; names the stretch.
 
     Raises:
-        ValueError: names the size or count that is not positive.
+        ValueError: a size or count that is not positive, or too many cells; names it.
     """
     lengths, counts = _checked_box(size, cells)
     edges = lengths / counts
@@ -121,25 +113,26 @@ def mesh_surface(
 ) -> TetMesh:
     """Fill a closed surface with tets of a BCC lattice by isosurface stuffing (Labelle and Shewchuk 2007).
 
-    Dihedral angles stay between 9.3 and 161.7 degrees where all cells are alike, above 9 in a graded lattice;
+    Dihedral angles stay between 9.3 and 161.7 degrees with cells of one size, above 9 in a graded lattice;
     boundary nodes lie on the surface. Parts thinner than about a cell can be lost. The same input always gives the
     same mesh, to the bit.
 
     Args:
         vertices: of the surface [m], shape (n_vertex, 3).
         triangles: vertex indices, shape (n_triangle, 3); turned outward where needed.
-        cell_size: cube edge of the lattice, of its fine cells where it is graded [m].
-        coarse_cell_size: edge of the largest cells, 2 or 4 times `cell_size` [m]; left out, all cells are alike.
-        fine_triangles: where the lattice is fine if it is graded: one bool per triangle, such as `triangles_facing`
-            gives; left out, along the whole surface.
-        fine_depth: cells that come within this distance of such a triangle along each axis are fine [m].
+        cell_size: cube edge of the lattice, of its fine cells if graded [m].
+        coarse_cell_size: edge of the largest cells, 2 or 4 times `cell_size` [m]; left out, all cells have one size.
+        fine_triangles: True for triangles surrounded by fine cells, shape (n_triangle,), for instance from
+            `triangles_facing`; left out, all of them.
+        fine_depth: cells within this distance of such a triangle along each axis are fine [m].
 
     Warns:
-        UserWarning: says what was dropped where thin parts fell off the largest body, or how many edges of the
-            boundary belong to more than two boundary triangles (a wall of thickness 0 there).
+        UserWarning: thin parts that fell off the largest body, or edges of more than two boundary triangles (a wall
+            of thickness 0).
 
     Raises:
-        MeshError: names what is wrong with the surface (see `check_surface`), or a cell size that would work.
+        MeshError: a surface that encloses no single body (see `check_surface`), or a cell size out of range; names
+            one that works.
     """
     size = float(cell_size)
     if not (np.isfinite(size) and size > 0):
@@ -165,14 +158,14 @@ def mesh_surface(
 
 
 def largest_body_mesh(nodes: FloatArray, tets: Int64Array, finer: str) -> TetMesh:
-    """The largest body of tets of any orientation, in the order of the kernels; warns as `mesh_surface` does.
+    """Mesh of the largest body of some tets, in the order of the kernels, with the warnings of `mesh_surface`.
 
     Args:
         nodes: points [m], shape (n, 3).
         tets: shape (n_tet, 4), not oriented.
-        finer: what keeps thinner parts, for the warnings.
+        finer: remedy against lost thin parts, for the warnings.
     """
-    tets = _largest_body(_positive(nodes, tets), tet_volumes(nodes, tets), finer)
+    tets = _largest_body(oriented_tets(nodes, tets), tet_volumes(nodes, tets), finer)
     used, renumbered = np.unique(tets, return_inverse=True)
     mesh = _swept_mesh(nodes[used], renumbered.reshape(-1, 4))
     _warn_of_pinches(mesh, finer)
@@ -198,27 +191,16 @@ def check_cell_size(extent: FloatArray, volume: float, size: float) -> None:
 
 
 def _swept_mesh(points: FloatArray, tets: Int64Array) -> TetMesh:
-    """The mesh of the tets, oriented, in the order of the kernels."""
-    return TetMesh(points, _positive(points, tets)[swept(points, tets)])
-
-
-def _positive(points: FloatArray, tets: Int64Array) -> Int64Array:
-    """The tets with corners ordered so that every volume is positive, shape (n_tet, 4)."""
-    negative = tet_volumes(points, tets) < 0
-    return np.where(negative[:, None], tets[:, [0, 1, 3, 2]], tets)
+    """Mesh of the tets in the order of the kernels."""
+    return TetMesh(points, tets[swept(points, tets)])
 
 
 def _largest_body(tets: Int64Array, volumes: FloatArray, finer: str) -> Int64Array:
-    """The tets of the largest part that is connected through faces; a common edge or node alone is a hinge."""
-    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    twin = np.flatnonzero((np.diff(faces[order], axis=0) == 0).all(axis=1))
-    left, right = order[twin] // 4, order[twin + 1] // 4
-    graph = coo_array((np.ones(len(twin), dtype=np.int8), (left, right)), shape=(len(tets), len(tets)))
-    count, label = connected_components(graph, directed=False)
+    """Tets of the largest part connected through faces; a common edge or node alone is a hinge."""
+    count, part = connected_tets(tets)
     if count == 1:
         return tets
-    kept = label == np.argmax(np.bincount(label))
+    kept = part == np.argmax(np.bincount(part))
     share = np.abs(volumes[~kept]).sum() / np.abs(volumes).sum()
     warnings.warn(
         f"{count - 1} part(s) of {int((~kept).sum())} tets ({share:.2%} of the volume) hang on the body by less than "

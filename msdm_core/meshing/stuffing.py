@@ -1,8 +1,6 @@
 """Isosurface stuffing (Labelle and Shewchuk 2007): a closed surface filled with tets of a body-centred cubic lattice.
 
-A grid of half cells lies around the surface; which of its points are inside and where its lines cross is asked first.
-
-Lattice coordinates count HALF cells, so that the nodes are the integer points whose coordinates are all even (cube
+Grid coordinates count HALF cells, so that the nodes are the integer points whose coordinates are all even (cube
 corners) or all odd (cube centres); an edge is long (two steps along an axis) or short (one step along a diagonal).
 A node's number is its row-major place in the enclosing integer grid.
 """
@@ -15,15 +13,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from msdm_core.mesh.surface import Int64Array, line_hits
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh.surface import line_hits
+from msdm_core.mesh.tet_mesh import FloatArray, Int64Array
 
 Field = Callable[[FloatArray], FloatArray]
 
-# Places along an edge are found to 2^-HALVINGS of it.
+# Bisections for the place of a cut on an edge: 2^-HALVINGS of its length.
 HALVINGS = 24
-# A node closer than this share of an edge to the surface moves onto it: the paper's "safe" values. Random signs and
-# cuts on a lattice (a million tets, cuts at the limits) gave dihedral angles of 9.317 to 161.643 degrees, never beyond.
+# Nodes move onto a surface within this share of an edge: the paper's "safe" values. Random signs and cuts on a lattice
+# (a million tets, cuts at the limits) gave dihedral angles of 9.317 to 161.643 degrees, never beyond.
 ALPHA_LONG, ALPHA_SHORT = 0.24999, 0.41189
 
 AXES = np.eye(3, dtype=np.int64) * 2
@@ -44,7 +42,7 @@ class Lattice:
 
     @property
     def strides(self) -> Int64Array:
-        """What one step along each axis adds to a node number, shape (3,)."""
+        """Increment of the node number per step along each axis, shape (3,)."""
         return np.array([self.shape[1] * self.shape[2], self.shape[2], 1], dtype=np.int64)
 
     def coordinates(self, nodes: Int64Array) -> Int64Array:
@@ -53,7 +51,7 @@ class Lattice:
 
 
 def lattice_around(vertices: FloatArray, cell_size: float, width: int = 1) -> Lattice:
-    """The lattice with cube edge `cell_size` [m] that has a corner node at the middle of the bounding box.
+    """Lattice of cubes with edge `cell_size` [m], with a cube corner at the middle of the bounding box.
 
     Its cells fill whole cubes of `width` (1, 2, 4, ...) cells along each edge, CLEAR_CELLS of them empty all around.
     """
@@ -82,7 +80,7 @@ def node_signs(grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattic
 def edge_fractions(
     step: Int64Array, node: Int64Array, grid_vertices: FloatArray, triangles: Int64Array, lattice: Lattice
 ) -> FloatArray:
-    """Fraction of each edge at which the surface crosses it, the middle crossing of several, shape (n,).
+    """Fraction of each edge at its crossing with the surface, the middle one of several, shape (n,).
 
     Args:
         step: from node to node, (3,), or (n, 3) for edges of one direction but several lengths; its largest
@@ -92,25 +90,24 @@ def edge_fractions(
         triangles: of the surface.
         lattice: the grid.
     """
-    one = np.atleast_2d(step)[0]
-    along = int(np.argmax(one))
+    direction = np.atleast_2d(step)[0]
+    along = int(np.argmax(direction))
     across = [axis for axis in range(3) if axis != along]
     length = step[..., along]
     # Coordinates that are constant along the line number it; on a diagonal they can be negative.
-    shear = one[across] // one[along]
+    shear = direction[across] // direction[along]
     reach = 2 * max(lattice.shape)
     nodes = lattice.coordinates(node)
     start = nodes[:, along]
     lines = nodes[:, across] - shear * start[:, None]
     projected = grid_vertices[:, across] - shear * grid_vertices[:, [along]]
-    row, column, at = [], [], []
     # Nodes are all even or all odd: so are the lines along an axis, and along a diagonal of the cube all are even.
-    for parity in (0,) if shear.all() else (0, 1):
-        hits = line_hits(projected[:, 0], projected[:, 1], grid_vertices[:, along], triangles, parity)
-        for column_list, values in zip((row, column, at), hits, strict=True):
-            column_list.append(values)
-    hit_at = np.concatenate(at)
-    hit_line = (np.concatenate(row) + reach) * (4 * reach) + np.concatenate(column) + reach
+    hits = [
+        line_hits(projected[:, 0], projected[:, 1], grid_vertices[:, along], triangles, parity)
+        for parity in ((0,) if shear.all() else (0, 1))
+    ]
+    row, column, hit_at = (np.concatenate(parts) for parts in zip(*hits, strict=True))
+    hit_line = (row + reach) * (4 * reach) + column + reach
     edge_line = (lines[:, 0] + reach) * (4 * reach) + lines[:, 1] + reach
     order = np.lexsort([hit_at, hit_line])
     hit_at, hit_line = hit_at[order], hit_line[order]
@@ -130,7 +127,7 @@ def edge_fractions(
 
 @dataclass(frozen=True)
 class Cuts:
-    """Where the surface cuts lattice edges, one cut per edge, in increasing order of (node, other)."""
+    """Cuts of lattice edges by the surface, one per edge, in increasing order of (node, other)."""
 
     node: Int64Array  # (n_cut,)
     other: Int64Array  # (n_cut,), above node
@@ -139,11 +136,11 @@ class Cuts:
 
 
 class Body(Protocol):
-    """What is filled with tets: where it is, which grid points lie inside, and where its surface cuts edges."""
+    """A body to be filled with tets."""
 
     @property
     def box(self) -> FloatArray:
-        """Points whose bounding box encloses the body [m], shape (n, 3)."""
+        """Points around the body: it lies in their bounding box [m], shape (n, 3)."""
         ...
 
     def signs(self, lattice: Lattice) -> NDArray[np.int8]:
@@ -151,7 +148,7 @@ class Body(Protocol):
         ...
 
     def fractions(self, step: Int64Array, node: Int64Array, sign: NDArray[np.int8], lattice: Lattice) -> FloatArray:
-        """Fraction of each edge at which its surface crosses it (n,); `step`, `node` as in `edge_fractions`."""
+        """Fraction of each edge at its crossing with the surface (n,); `step`, `node` as in `edge_fractions`."""
         ...
 
 
@@ -181,10 +178,10 @@ class SurfaceBody:
 
 @dataclass(frozen=True, eq=False)
 class LevelSetBody:
-    """Where a function of place is above 0, in a box.
+    """The region of a box with a positive value of a function.
 
     Fields:
-        value: continuous, of places [m] (n, 3), shape (n,); its sign alone is used, below 0 outside of the box
+        value: continuous function of points [m] (n, 3), shape (n,), below 0 outside the box; its sign alone is used
         box: two opposite corners [m] (2, 3)
     """
 
@@ -213,18 +210,17 @@ def stuff(body: Body, lattice: Lattice) -> tuple[FloatArray, Int64Array]:
     """Fill a body with tets: points (n_node, 3) [m] and tets (n_tet, 4) (Labelle and Shewchuk 2007, algorithm 1).
 
     Args:
-        body: a closed surface's or a level set's.
+        body: inside of a closed surface or level set.
         lattice: around it, from `lattice_around`.
     """
     sign = body.signs(lattice)
-    cuts, warped_to = _warp(_edge_cuts(body, lattice, sign), sign, lattice)
-    background = _background_tets(lattice, sign)
-    tets = _stencils(background, sign, cuts, lattice)
-    return _compressed(tets, warped_to, cuts, lattice)
+    cuts = _edge_cuts(body, lattice, sign)
+    limit = np.where(cuts.is_long, ALPHA_LONG, ALPHA_SHORT)
+    return fill_background(_background_tets(lattice, sign), cuts, limit, sign, lattice)
 
 
 def _roots(value: Field, start: FloatArray, span: FloatArray, inside: NDArray[np.bool_]) -> FloatArray:
-    """Where along start + t span a function changes sign, by halving, shape (n,); `inside` is its sign at t = 0."""
+    """Sign changes t of a function along start + t span, by bisection, shape (n,); `inside` is its sign at t = 0."""
     low, high = np.zeros(len(start)), np.ones(len(start))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
@@ -236,13 +232,13 @@ def _roots(value: Field, start: FloatArray, span: FloatArray, inside: NDArray[np
 def fill_background(
     background: Int64Array, cuts: Cuts, limit: FloatArray, sign: NDArray[np.int8], lattice: Lattice
 ) -> tuple[FloatArray, Int64Array]:
-    """The part of conforming tets of grid points that lies inside: points (n_node, 3) [m] and tets (n_tet, 4).
+    """Inner part of conforming tets of grid points: points (n_node, 3) [m] and tets (n_tet, 4).
 
     Args:
         background: the tets, shape (n, 4).
-        cuts: of all their edges whose ends lie on different sides.
-        limit: share of each cut edge within which a node moves onto the surface, shape (n_cut,).
-        sign: from `node_signs`; 0 afterwards at nodes that moved.
+        cuts: of all their edges between inside and outside.
+        limit: nodes move onto the surface within this share of a cut edge, shape (n_cut,).
+        sign: of the grid points; 0 afterwards at moved nodes.
         lattice: the grid.
     """
     cuts, warped_to = _warp(cuts, sign, lattice, limit)
@@ -251,13 +247,12 @@ def fill_background(
 
 
 def _edge_cuts(body: Body, lattice: Lattice, sign: NDArray[np.int8]) -> Cuts:
-    """The cuts of all lattice edges whose ends lie on different sides."""
-    found = []
+    """Cuts of all lattice edges between inside and outside."""
+    cuts = []
     for step in np.concatenate([AXES, DIAGONALS]):
         node = _changing_edges(step, sign, lattice)
-        fraction = body.fractions(step, node, sign, lattice)
-        found.append((node, node + (step * lattice.strides).sum(), fraction))
-    node, other, fraction = (np.concatenate(column) for column in zip(*found, strict=True))
+        cuts.append((node, node + (step * lattice.strides).sum(), body.fractions(step, node, sign, lattice)))
+    node, other, fraction = (np.concatenate(column) for column in zip(*cuts, strict=True))
     order = np.lexsort([other, node])
     is_long = (lattice.coordinates(node) % 2 == lattice.coordinates(other) % 2).all(axis=1)
     return Cuts(node[order], other[order], fraction[order], is_long[order])
@@ -275,18 +270,16 @@ def _changing_edges(step: Int64Array, sign: NDArray[np.int8], lattice: Lattice) 
 
 
 def _warp(
-    cuts: Cuts, sign: NDArray[np.int8], lattice: Lattice, limit: FloatArray | None = None
+    cuts: Cuts, sign: NDArray[np.int8], lattice: Lattice, limit: FloatArray
 ) -> tuple[Cuts, dict[int, FloatArray]]:
-    """Move nodes onto cuts that are too close to them, nearest first; such nodes get sign 0 and lose their other cuts.
+    """Move nodes onto cuts within `limit`, a share of the edge, nearest first; they get sign 0 and lose other cuts.
 
-    A cut is too close within `limit`, a share of its edge, (n_cut,); left out, the safe values of BCC tets.
-    Returns the cuts that remain and the grid coordinates of each moved node.
+    Returns the remaining cuts and the grid coordinates of each moved node.
     """
     nearer_node = cuts.fraction < 0.5
     share = np.where(nearer_node, cuts.fraction, 1 - cuts.fraction)
     span = lattice.coordinates(cuts.other) - lattice.coordinates(cuts.node)
     distance = share * np.sqrt((span * span).sum(axis=1))
-    limit = np.where(cuts.is_long, ALPHA_LONG, ALPHA_SHORT) if limit is None else limit
     violating = np.flatnonzero(share < limit)
     violating = violating[np.argsort(distance[violating], kind="stable")]
     near = np.where(nearer_node, cuts.node, cuts.other)[violating].tolist()
@@ -312,7 +305,7 @@ def _background_tets(lattice: Lattice, sign: NDArray[np.int8]) -> Int64Array:
     """Lattice tets with a node inside, shape (n, 4): two cube centres, then two corners of the face between them."""
     odd = [np.arange(1, n - 2, 2) for n in lattice.shape]
     centre = np.ravel_multi_index(np.meshgrid(*odd, indexing="ij"), lattice.shape).ravel().astype(np.int64)
-    found = []
+    tets = []
     for axis in range(3):
         step = lattice.strides[axis]
         side, up = (lattice.strides[(axis + turn) % 3] for turn in (1, 2))
@@ -322,8 +315,8 @@ def _background_tets(lattice: Lattice, sign: NDArray[np.int8]) -> Int64Array:
             inside = np.zeros(len(centre), dtype=bool)
             for offset in offsets:
                 inside |= sign[centre + offset] > 0
-            found.append(centre[inside][:, None] + offsets)
-    return np.concatenate(found)
+            tets.append(centre[inside][:, None] + offsets)
+    return np.concatenate(tets)
 
 
 def _prism_table() -> dict[tuple[bool, bool, bool], list[tuple[int, int, int, int]]]:
@@ -344,7 +337,7 @@ _PRISM_TETS = _prism_table()
 
 
 def _stencils(background: Int64Array, sign: NDArray[np.int8], cuts: Cuts, lattice: Lattice) -> Int64Array:
-    """The part of each lattice tet that lies inside, as tets of nodes and (n_grid + cut index), shape (n_tet, 4)."""
+    """Inner part of each lattice tet, as tets of nodes and (n_grid + cut index), shape (n_tet, 4)."""
     side = sign[background]
     # Inside nodes first, then those on the surface, then those outside: the cases below need no permutations.
     order = np.argsort(-side, axis=1, kind="stable")
@@ -357,9 +350,8 @@ def _stencils(background: Int64Array, sign: NDArray[np.int8], cuts: Cuts, lattic
 
     whole = corners[outside == 0]
     tips = corners[(inside == 1) & (outside > 0)]
-    on_surface = sign[tips] == 0
-    tips = np.where(on_surface, tips, cut(tips[:, :1], tips)) if len(tips) else tips
-    tips[:, 0] = corners[(inside == 1) & (outside > 0)][:, 0]
+    ends = tips[:, 1:]
+    tips[:, 1:] = np.where(sign[ends] == 0, ends, cut(tips[:, :1], ends))
     a, b, zero, out = corners[(inside == 2) & (outside == 1)].T
     from_a = _diagonal_from_first(a, b, out, lattice)
     first, second = np.where(from_a, a, b), np.where(from_a, b, a)
@@ -387,11 +379,11 @@ def _prisms(corners: Int64Array, choice: NDArray[np.bool_]) -> Int64Array:
 
 
 def _diagonal_from_first(a: Int64Array, b: Int64Array, out: Int64Array, lattice: Lattice) -> NDArray[np.bool_]:
-    """Whether the quad left of triangle (a, b inside; out) is cut from a to the cut of b-out, or from b; shape (n,).
+    """True if the quad left of triangle (a, b inside; out) is cut from a to the cut of b-out, False from b; shape (n,).
 
     Both tets at a face must agree, so the rule knows the face alone (Labelle and Shewchuk 2007, section 3): the
-    diagonal ends at the cut of the longer edge; where both are equally long, it starts at the node that exceeds the
-    cut in an even number of coordinates; where both do (in graded lattices alone), at the lower node. A node has
+    diagonal ends at the cut of the longer edge; of two equally long ones, it starts at the node that exceeds the
+    cut in an even number of coordinates; if both do (in graded lattices alone), at the lower node. A node has
     three equally long edges in half pyramids alone, where these rules do not turn in a circle either.
     """
     from_a, from_b = (lattice.coordinates(nodes) - lattice.coordinates(out) for nodes in (a, b))
@@ -403,7 +395,7 @@ def _diagonal_from_first(a: Int64Array, b: Int64Array, out: Int64Array, lattice:
 def _compressed(
     tets: Int64Array, warped_to: dict[int, FloatArray], cuts: Cuts, lattice: Lattice
 ) -> tuple[FloatArray, Int64Array]:
-    """Points [m] of the used nodes and cuts, in that order, and the tets that number them from 0."""
+    """Points [m] of the used nodes and cuts, in that order, and the tets, numbered from 0."""
     used, renumbered = np.unique(tets, return_inverse=True)
     grid_size = int(np.prod(lattice.shape))
     nodes, used_cuts = used[used < grid_size], used[used >= grid_size] - grid_size

@@ -1,6 +1,6 @@
-"""Compiling an organ from its specification, and its state at rest.
+"""Compilation of an organ from its specification, and its state at rest.
 
-Under gravity an organ rests on its anchors and supports: dynamic relaxation, remembered for the last organs.
+Under gravity an organ settles on its anchors and supports by dynamic relaxation, cached for the last organs.
 """
 
 import hashlib
@@ -15,13 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
-from msdm_core.kernels.squeeze_kernels import STEEP_WIDTH
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
-from msdm_core.kernels.vector_kernels import aligned_zeros
 from msdm_core.material.lumping import MassScheme, lump_mass
 from msdm_core.material.regions import (
     Capsule,
@@ -37,20 +34,21 @@ from msdm_core.material.regions import (
 from msdm_core.material.stiffness import membrane_stiffness, spring_network, spring_sum
 from msdm_core.material.tissue_law import ARM_COUNT, Stiffening
 from msdm_core.mesh.ordering import spring_order
-from msdm_core.mesh.tet_mesh import FloatArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, TetMesh, area_vectors
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.foundation import Foundation, foundation_fields
 from msdm_core.organ.measure import spring_tensions
 from msdm_core.organ.motion import Motion, motion_fields
 from msdm_core.organ.stability import own_step, steep_sweeps
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
 
 # A hundred times the Earth's [m/s^2]; no organ settles under more, and forces overflow.
 GRAVITY_LARGEST = 1000.0
-# How many settled organs are remembered, the most recently used.
-REMEMBERED = 32
-# Forces balance when their magnitudes sum to less than this share of the weight of the organ.
+# Settled organs in the cache, the most recently used.
+CACHED = 32
+# Tolerance of equilibrium: sum of the magnitudes of node forces over the weight of the organ.
 FORCE_TOLERANCE = 1e-6
 ROUNDS, ROUND_STEPS = 4000, 10
 
@@ -59,11 +57,11 @@ _settled: OrderedDict[bytes, tuple[FloatArray, FloatArray]] = OrderedDict()
 
 @dataclass(frozen=True)
 class OrganSpec:
-    """The specification of an organ, for `compile_organ`.
+    """Specification of an organ, for `compile_organ`.
 
     Args:
         mesh: its tets.
-        materials: one Material, or a mapping from mesh region name to Material that covers every region.
+        materials: one Material, or a mapping from the name of each mesh region to its Material.
         capsule: the outer layer, or None.
         lesions: regions of their own material, applied in order.
         anchors: indices of the nodes held fixed, shape (n_anchor,).
@@ -71,9 +69,9 @@ class OrganSpec:
         mass_scheme: "barycentric" (eq. 2) or "voronoi" (eq. 5).
         stiffness_rule: "lloyd" (eq. 6) or "fitted" (eq. 6 times factors fitted to the mesh).
         gravity: [m/s^2]; off by default, because a scanned shape is the equilibrium.
-        supports: fixed solids that it rests on.
+        supports: fixed solids below it.
         support_law: their contact law.
-        foundations: elastic ones that hold its surface.
+        foundations: elastic foundations of its surface.
         motions: of anchors, supports and foundations (`organ.motion`).
     """
 
@@ -95,7 +93,7 @@ class OrganSpec:
 def compile_organ(spec: OrganSpec) -> OrganModel:
     """Masses, springs and volume moduli of an organ, as read-only arrays for the kernels.
 
-    A tet that a lesion fills in part has the mean density by volume, and `mixed_moduli`.
+    A tet partly inside a lesion has the mean density by volume, and `mixed_moduli`.
 
     Raises:
         OrganError: an organ of impossible size, a region without material, a lesion outside the organ or smaller than
@@ -115,8 +113,6 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     spring_law = _spring_law(spec, law, spring_modulus, order.springs, stiffness)
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
-    corners = mesh.points[surface]
-    area = 0.5 * norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     supports = support_fields(spec.supports, spec.support_law, mesh, surface, anchored)
     foundations = foundation_fields(spec.foundations, mesh, anchored)
     model = OrganModel(
@@ -137,7 +133,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         node_bulk=_read_only(node_bulk),
         averages_volume=bool(node_bulk.any()),
         surface_triangles=_read_only(np.ascontiguousarray(surface)),
-        surface_rest_area=_read_only(area),
+        surface_rest_area=_read_only(norm(area_vectors(mesh.points[surface]), axis=1)),
         **supports,
         **foundations,
         **motion_fields(
@@ -153,10 +149,9 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
 
 
 def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
-    """A state at rest, with contact memory for `shape_count` shapes; under gravity the settled static equilibrium.
+    """State at rest, with contact memory for `shape_count` shapes; under gravity the static equilibrium.
 
-    The organ settles from its undeformed shape onto its supports, their friction included; the organs settled last are
-    remembered.
+    The organ settles from its undeformed shape onto its supports, their friction included.
 
     Raises:
         OrganDivergedError: gravity turns the organ inside out or it does not settle.
@@ -167,57 +162,8 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     return state
 
 
-def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
-    """The undeformed organ at rest, without contact, with contact memory for `shape_count` shapes."""
-    point_count = len(model.surface_triangles) * QUADRATURE_COUNT
-    steep_count = len(model.spring_nodes) if model.stiffens else 0
-    return OrganState(
-        node_position=model.node_rest_position.copy(),
-        node_velocity=np.zeros_like(model.node_rest_position),
-        node_force=np.zeros_like(model.node_rest_position),
-        node_tension=np.zeros_like(model.node_mass),
-        row_position=aligned_zeros((len(model.node_mass), 4)),
-        row_velocity=aligned_zeros((len(model.node_mass), 4)),
-        row_force=aligned_zeros((len(model.node_mass), 4)),
-        squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
-        node_pairs=aligned_zeros((len(model.node_softness), 2)),
-        node_steepness=np.zeros_like(model.node_softness),
-        spring_lengths=np.zeros(steep_count),
-        steep_springs=np.zeros(steep_count, dtype=np.int32),
-        steep_places=np.zeros(steep_count, dtype=np.int32),
-        steep_rows=aligned_zeros((steep_count, STEEP_WIDTH)),
-        steep_speed=aligned_zeros((len(model.node_softness), 3)),
-        spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
-        spring_relief=np.zeros_like(model.spring_gain),
-        contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
-        contact_stretch=np.zeros((shape_count, point_count, 3)),
-        contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
-        contact_rows=np.zeros((shape_count * point_count, ROW_WIDTH)),
-        contact_places=np.zeros((shape_count * point_count, PLACE_WIDTH), dtype=np.int32),
-        contact_hold=np.zeros_like(model.node_mass),
-        contact_passed=np.zeros(2, dtype=np.int32),
-        support_stretch=np.zeros((len(model.support_nodes), len(model.support_kind), 3)),
-        motion=np.zeros((len(model.motion_node_shift), 4)),
-        ground_foundation=model.foundation_position.copy(),
-        ground_support=np.stack([model.support_position, np.zeros_like(model.support_position)], axis=1),
-        ground_load=np.zeros_like(model.support_position),
-        ground_rate=np.zeros(len(model.motion_node_shift)),
-        volume_ratio_smallest=np.ones(1),
-        lane_fault=np.zeros(1, dtype=np.int32),
-        moving=np.ones(1),
-        finite_sum=np.zeros(1),
-        candidate_count=np.zeros(1, dtype=np.int32),
-        contact_kept=np.ones(1, dtype=np.uint8),
-        contact_count=np.zeros(1, dtype=np.int32),
-    )
-
-
 def _settle(model: OrganModel, state: OrganState) -> None:
-    """Bring a state from the undeformed position to rest under gravity, in place; the same organ settles only once.
-
-    Raises:
-        OrganDivergedError: gravity turns the organ inside out or it does not settle.
-    """
+    """Bring a state from the undeformed position to rest under gravity, in place; cached for the same organ."""
     key = _content(model)
     settled = _settled.pop(key, None)
     if settled is None:
@@ -225,7 +171,7 @@ def _settle(model: OrganModel, state: OrganState) -> None:
         settled = state.node_position.copy(), state.support_stretch.copy()
     # Moved to the end: the least recently used organ is forgotten first.
     _settled[key] = settled
-    if len(_settled) > REMEMBERED:
+    if len(_settled) > CACHED:
         _settled.popitem(last=False)
     state.node_position[:], state.support_stretch[:] = settled
     relax_arms(model, state)
@@ -236,7 +182,7 @@ def _settle(model: OrganModel, state: OrganState) -> None:
 
 
 def _content(model: OrganModel) -> bytes:
-    """A digest of all numbers of an organ."""
+    """Digest of all numbers of an organ."""
     digest = hashlib.blake2b(digest_size=16)
     for value in model:
         array = np.ascontiguousarray(value)
@@ -246,7 +192,7 @@ def _content(model: OrganModel) -> bytes:
 
 
 def _relax(model: OrganModel, state: OrganState) -> None:
-    """Dynamic relaxation: advance the organ, the mode that gravity excites damped critically, until forces balance.
+    """Dynamic relaxation: advance the organ, the mode excited by gravity critically damped, until forces balance.
 
     alpha = 2 w, w^2 = -(u . f) / (u . M u) (Rayleigh's quotient of the displacement u, f the forces without gravity).
     """
@@ -287,7 +233,7 @@ def _check_extent(mesh: TetMesh) -> None:
     extent = float(np.ptp(mesh.points, axis=0).max())
     if not SMALLEST_EXTENT <= extent <= LARGEST_EXTENT:
         raise OrganError(
-            f"the organ is {extent:.4g} m long; between {SMALLEST_EXTENT:g} and {LARGEST_EXTENT:g} m is possible: "
+            f"the organ is {extent:.4g} m long; the rule is {SMALLEST_EXTENT:g} to {LARGEST_EXTENT:g} m: "
             'was its length unit forgotten? (length_unit="mm")'
         )
 
@@ -303,10 +249,10 @@ def _checked_gravity(gravity: tuple[float, float, float]) -> FloatArray:
 
 @dataclass(frozen=True)
 class _TetLaw:
-    """How the tissue of each tet stiffens and relaxes.
+    """Stiffening and relaxation of each tet.
 
     Fields:
-        rise: c - 1, 0 where it is linear                                        (n_tet,)
+        rise: c - 1, 0 for linear tissue                                         (n_tet,)
         onset, width: e0 and e1 - e0, times the rise                             (n_tet,)
         arm_modulus: g_i                                                         (3, n_tet)
     """
@@ -318,11 +264,11 @@ class _TetLaw:
 
     @classmethod
     def linear(cls, count: int) -> "_TetLaw":
-        """No law on any of `count` tets."""
+        """Linear tissue in `count` tets."""
         return cls(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((ARM_COUNT, count)))
 
     def mix(self, material: Material, fraction: FloatArray | float, members: Any = slice(None)) -> None:
-        """Fill a share of the volume of some tets with a material, in place; what depends on the rise is its mean."""
+        """Fill a fraction of the volume of member tets with a material, in place: means by volume."""
         stiffening = material.stiffening or Stiffening(0.0, 1.0, 1.0)
         rise = stiffening.tangent_cap - 1.0
         for array, value in (
@@ -340,35 +286,33 @@ class _TetLaw:
 def _spring_law(
     spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, springs: NDArray[np.intp], stiffness: FloatArray
 ) -> dict[str, Any]:
-    """The model's fields of stiffening and relaxation, springs in the kernels' order with their stiffness [N/m].
+    """Fields of an OrganModel for stiffening and relaxation, springs in the kernels' order with their stiffness [N/m].
 
-    A node stiffens by the mean of its tets, weighted by volume and modulus; a spring relaxes by that of its tets,
-    weighted by the stiffness that each adds to it. Organs side by side share these fields: an amount that is the same
-    in all tets has the same bits everywhere, whatever the moduli.
+    A node stiffens by the mean of its tets, weighted by volume and modulus; a spring relaxes by the mean of its tets,
+    weighted by their shares of its stiffness. Organs side by side share these fields: an amount equal in all tets has
+    the same bits at all nodes and springs, independent of the moduli.
     """
     mesh = spec.mesh
 
-    def mean(amount: FloatArray) -> FloatArray:
-        """Of each spring."""
+    def spring_mean(amount: FloatArray) -> FloatArray:
         first = float(amount[0])
-        total = spring_sum(mesh, spring_modulus, np.ones(mesh.tet_count), rule=spec.stiffness_rule)
-        differing = spring_sum(mesh, spring_modulus, amount - first, rule=spec.stiffness_rule)
-        return first + (differing / total)[springs]
+        total = spring_sum(mesh, spring_modulus, spec.stiffness_rule)
+        difference = spring_sum(mesh, spring_modulus * (amount - first), spec.stiffness_rule)
+        return first + (difference / total)[springs]
+
+    def node_sum(values: FloatArray) -> FloatArray:
+        return np.bincount(mesh.tets.ravel(), np.repeat(values, 4), mesh.node_count).astype(np.float64)
 
     def node_mean(amount: FloatArray, weight: FloatArray) -> FloatArray:
-        """Of each node; that of the first tet with a weight where no tet of the node has one."""
+        # Nodes without weight have the amount of the first tet with a weight.
         first = float(amount[np.argmax(weight > 0.0)])
+        total = node_sum(weight)
+        difference = node_sum(weight * (amount - first))
+        return first + np.divide(difference, total, out=np.zeros_like(total), where=total > 0.0)
 
-        def at_nodes(values: FloatArray) -> FloatArray:
-            return np.bincount(mesh.tets.ravel(), np.repeat(values, 4), mesh.node_count).astype(np.float64)
-
-        total = at_nodes(weight)
-        differing = at_nodes(weight * (amount - first))
-        return first + np.divide(differing, total, out=np.zeros_like(total), where=total > 0.0)
-
-    none = _read_only(np.zeros(0))
-    fields: dict[str, Any] = dict.fromkeys(("node_softness", "node_onset", "node_growth", "node_excess"), none)
-    fields |= {"spring_gain": none, "spring_arm_modulus": none, "arm_time": _read_only(_arm_times(spec))}
+    empty = _read_only(np.zeros(0))
+    fields: dict[str, Any] = dict.fromkeys(("node_softness", "node_onset", "node_growth", "node_excess"), empty)
+    fields |= {"spring_gain": empty, "spring_arm_modulus": empty, "arm_time": _read_only(_arm_times(spec))}
     fields |= {"steep_sweeps": steep_sweeps(1.0 + float(law.rise.max())), "steep_rise": math.inf}
     fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
     if fields["stiffens"]:
@@ -387,18 +331,18 @@ def _spring_law(
         fields["node_excess"] = _read_only(rise * width)
         fields["steep_rise"] = _steep_rise(onset, width, rise, nodes)
     if fields["relaxes"]:
-        moduli = np.stack([mean(arm) for arm in law.arm_modulus])
+        moduli = np.stack([spring_mean(arm) for arm in law.arm_modulus])
         fields["spring_gain"] = _read_only(1.0 + moduli.sum(axis=0))
         fields["spring_arm_modulus"] = _read_only(moduli.ravel())
     return fields
 
 
 def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray, springs: NDArray[np.int32]) -> float:
-    """The least of what stiffening adds to the tension of springs (n, 2) where it adds STEEP_EXCESS to their tangent.
+    """Lower bound of the relative rise of tension in springs (n, 2) with a tangent raised by STEEP_EXCESS.
 
-    Half the rise of a node, h, is a convex function of its steepness q: above its tangent at q = STEEP_EXCESS, of slope
-    m. So the sum for ends whose mean steepness is that is at least h1 + h2 - STEEP_EXCESS |m1 - m2|; and one end has
-    that steepness, so that it is at least the lesser of both. A node whose cap is below has no such steepness.
+    Half the rise of a node, h, is a convex function of its steepness q: it lies above its tangent at q = STEEP_EXCESS,
+    of slope m. So the sum for two ends with this mean steepness is at least h1 + h2 - STEEP_EXCESS |m1 - m2|; and at
+    least one end has this steepness, so that the sum is at least the lesser h. A node with a lower cap never has it.
     """
     steep = rise > STEEP_EXCESS
     ramp = np.sqrt(STEEP_EXCESS / np.maximum(rise, STEEP_EXCESS))
@@ -412,7 +356,7 @@ def _steep_rise(onset: FloatArray, width: FloatArray, rise: FloatArray, springs:
 
 
 def _arm_times(spec: OrganSpec) -> FloatArray:
-    """Times of the Maxwell arms of all materials [s], inf where there is none, (3,)."""
+    """Times of the Maxwell arms of all materials [s], inf for none, (3,)."""
     materials = [*_materials_by_tag(spec).values(), *(cast(Material, lesion.material) for lesion in spec.lesions)]
     known = {material.relaxation.times for material in materials if material.relaxation is not None}
     if len(known) > 1:
@@ -421,13 +365,13 @@ def _arm_times(spec: OrganSpec) -> FloatArray:
             "share their times: give each material all of them, with a relative modulus of 0 where it has none"
         )
     times = np.full(ARM_COUNT, np.inf)
-    for chosen in known:
-        times[: len(chosen)] = chosen
+    for arm_times in known:
+        times[: len(arm_times)] = arm_times
     return times
 
 
 def relax_arms(model: OrganModel, state: OrganState) -> None:
-    """Let the Maxwell arms of all springs relax fully at the present positions, in place: a held organ after long."""
+    """Relax the Maxwell arms of all springs fully at the present positions, in place."""
     if not model.relaxes:
         return
     ends = state.node_position[model.spring_nodes]

@@ -1,6 +1,5 @@
-"""Elastic foundations: tissue around an organ holds its surface by springs to the ground (Winkler's foundation)."""
+"""Elastic foundations: springs from an organ's surface to the ground, for the tissue around it (Winkler)."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import norm
-from msdm_core.errors import OrganError
-from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.errors import OrganError, require_not_negative, require_positive
+from msdm_core.mesh.tet_mesh import TetMesh, area_vectors
 
 
 @dataclass(frozen=True, eq=False)
 class Foundation:
-    """Springs from a part of an organ's surface to the ground, so many per area; they pull as they push.
+    """Springs from a part of an organ's surface to the ground, in tension and compression alike.
 
     Args:
         name: used in messages.
@@ -30,19 +29,12 @@ class Foundation:
     shear_stiffness: float
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
-            raise OrganError(
-                f"foundation {self.name!r}: stiffness is {self.stiffness:g} N/m^3; it must be finite and above 0"
-            )
-        if not (math.isfinite(self.shear_stiffness) and self.shear_stiffness >= 0.0):
-            raise OrganError(
-                f"foundation {self.name!r}: shear_stiffness is {self.shear_stiffness:g} N/m^3; it must be finite and "
-                "at least 0"
-            )
+        require_positive(f"foundation {self.name!r}: stiffness", self.stiffness, "N/m^3")
+        require_not_negative(f"foundation {self.name!r}: shear_stiffness", self.shear_stiffness, "N/m^3")
 
 
 def foundation_fields(foundations: Sequence[Foundation], mesh: TetMesh, anchored: NDArray[np.bool_]) -> dict[str, Any]:
-    """The fields of an OrganModel that describe its foundations.
+    """Fields of an OrganModel for its foundations.
 
     A node has the stiffness K = sum over the surface triangles around it of (A / 3) (k_t I + (k_n - k_t) n n^T), with
     the area A and the normal n of each; those of several foundations add up.
@@ -50,22 +42,21 @@ def foundation_fields(foundations: Sequence[Foundation], mesh: TetMesh, anchored
     Args:
         foundations: on the organ.
         mesh: the organ.
-        anchored: the nodes held fixed, shape (n_node,); foundations do not act on them.
+        anchored: True for the nodes held fixed, shape (n_node,); foundations do not act on them.
 
     Raises:
-        OrganError: nodes that are not on the surface.
+        OrganError: nodes off the surface.
     """
     blocks = np.zeros((mesh.node_count, 3, 3))
     triangles = mesh.boundary_triangles
-    corners = mesh.points[triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # |a x b| is twice the area; n n^T A / 3 = (a x b)(a x b)^T / (6 |a x b|).
-    double = norm(across, axis=1)
+    normals = area_vectors(mesh.points[triangles])
+    area = norm(normals, axis=1)[:, None, None]
+    # (A / 3) I and (A / 3) n n^T.
+    third = area / 3.0 * np.eye(3)
+    normal = normals[:, :, None] * normals[:, None, :] / (3.0 * area)
     for foundation in foundations:
         held = np.zeros(mesh.node_count, dtype=bool)
         held[_surface_nodes(foundation, mesh)] = True
-        third = double[:, None, None] / 6.0 * np.eye(3)
-        normal = across[:, :, None] * across[:, None, :] / (6.0 * double[:, None, None])
         each = foundation.shear_stiffness * (third - normal) + foundation.stiffness * normal
         for corner in range(3):
             inside = held[triangles[:, corner]]

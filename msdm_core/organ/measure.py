@@ -1,4 +1,4 @@
-"""Quantities of the state of an organ: energy, tissue load, volume ratios, inverted tets, forces of supports."""
+"""Measured quantities of an organ's state: energy, tissue load, volume ratios, inverted tets, forces of supports."""
 
 from typing import NamedTuple
 
@@ -14,11 +14,10 @@ from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
 from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_volume_ratios
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.support_kernels import add_support_forces, place_ground
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, area_vectors
 from msdm_core.organ.motion import SIGNAL
 
-# Of strains, as a margin.
-ROUNDING = 1e-12
+ROUNDING = 1e-12  # margin of strains
 
 
 def kinetic_energy(model: OrganModel, state: OrganState) -> float:
@@ -31,10 +30,10 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
 
     U = sum_s U_s(l_s) + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
         + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) + sum_h u_h . K_h u_h / 2 - sum_i m_i g . (x_i - X_i)
-    where U_s is the energy of a spring, k (l - l0)^2 / 2 if none stiffens, without Maxwell arms, a is a volume averaged
-    at a node, K'_t the share averaged and the fourth sum over tets below s = SQUEEZED_RATIO (infinite for one
-    that is inside out), and u_h the displacement of a node on an elastic foundation. A resting tool's `contact_energy`
-    is not in it, nor what supports store.
+    with U_s the energy of a spring, k (l - l0)^2 / 2 if linear, without Maxwell arms; a the volumes averaged at nodes;
+    K'_t the averaged share of the modulus, its sum over tets below s = SQUEEZED_RATIO (infinite for a tet inside out);
+    u_h the displacement of a node on an elastic foundation. Contact with tools (`contact_energy`) and supports is not
+    included.
     """
     ends = state.node_position[model.spring_nodes]
     length = norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -57,41 +56,44 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
 
 
 def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Tension of each spring without its Maxwell arms where all have some lengths [m] (n_spring,) [N], (n_spring,)."""
-    change = length - model.spring_rest_length
-    tension = model.spring_stiffness * change
+    """Tension of each spring at lengths [m] (n_spring,), without Maxwell arms [N], (n_spring,)."""
+    tension = model.spring_stiffness * (length - model.spring_rest_length)
     if not model.stiffens:
         return tension
-    rise = _node_rises(model, node_strains(model, length))
+    rise = node_rises(model, node_strains(model, length))
     return tension * (1.0 + rise[model.spring_nodes].mean(axis=1))
 
 
 def node_strains(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Equivalent strain of each node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs of some lengths [m]."""
+    """Equivalent strain of each node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs of lengths l [m]."""
     twice = model.spring_stiffness * np.square(length - model.spring_rest_length)
     return np.sqrt(model.node_softness * np.bincount(model.spring_nodes.ravel(), np.repeat(twice, 2)))
 
 
-def _node_rises(model: OrganModel, strain: FloatArray) -> FloatArray:
-    """What stiffening adds to tension over that of linear springs (`element_kernels.node_law`), (n_node,)."""
-    beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
-    ramp = np.minimum(beyond, 1.0)
+def node_rises(model: OrganModel, strain: FloatArray) -> FloatArray:
+    """Relative rise of tension over linear springs at each node (`element_kernels.node_law`), (n_node,)."""
+    beyond, ramp = _ramps(model, strain)
     return model.node_excess * ((ramp * ramp * ramp) / 3.0 + (beyond - ramp)) / np.maximum(strain, STRAIN_LEAST)
 
 
-def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Energy of all springs of some lengths [m] (n_spring,), without Maxwell arms, shared among them [J], (n_spring,).
+def _ramps(model: OrganModel, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """U = (s - e0) / (e1 - e0) from 0 on and v = min(u, 1) of each node (`Stiffening`), (n_node,) each."""
+    beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
+    return beyond, np.minimum(beyond, 1.0)
 
-    U = sum_s k (l - l0)^2 / 2 + sum_a A_a w_a(s_a), where w_a' is what stiffening adds to the strain s_a in the
-    tension and A_a = sum k l0^2 / 10 over the springs of node a; a node's part belongs to its springs as k (l - l0)^2
-    does. The gradient is `spring_tensions`.
+
+def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
+    """Energy of each spring at lengths [m] (n_spring,), without Maxwell arms [J], (n_spring,).
+
+    Their sum is U = sum_s k (l - l0)^2 / 2 + sum_a A_a w_a(s_a), with w_a' the rise of tension over a linear spring's
+    at the strain s_a and A_a = sum k l0^2 / 10 over the springs of node a, a node's part divided among its springs as
+    k (l - l0)^2. The gradient is `spring_tensions`.
     """
     twice = model.spring_stiffness * np.square(length - model.spring_rest_length)
     if not model.stiffens:
         return 0.5 * twice
     strain = node_strains(model, length)
-    beyond = np.maximum((strain - model.node_onset) * model.node_growth, 0.0)
-    ramp = np.minimum(beyond, 1.0)
+    beyond, ramp = _ramps(model, strain)
     over = beyond - ramp
     added = (
         model.node_excess / model.node_growth * (ramp * ramp * ramp * ramp / 12.0 + over / 3.0 + 0.5 * (over * over))
@@ -102,15 +104,14 @@ def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
 
 
 def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> float:
-    """Energy stored in the contact between tissue and shapes in their present places, without that of friction [J].
+    """Elastic energy of the contact between tissue and shapes in their present places, without friction [J].
 
     E = sum over shapes and quadrature points of (k_p / 2) A g^2, g = s (s + t) / r: with d from the shape's core to the
-    point and n the triangle's normal, t = d . n and s^2 = r^2 - (|d|^2 - t^2). Counted are points inside the shape that
-    it meets from outside (t <= 0) or holds already (`state.contact_engaged`). What the guard of an axis stores is not
-    in it.
+    point and n the triangle's normal, t = d . n and s^2 = r^2 - (|d|^2 - t^2). Counted are points inside the shape with
+    t <= 0 (met from outside) or already in contact (`state.contact_engaged`). The guard of the axes is not included.
     """
     corners = state.node_position[model.surface_triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = area_vectors(corners)
     normal /= norm(normal, axis=1)[:, None]
     points = matmul(QUADRATURE_BARYCENTRIC, corners)
     energy = 0.0
@@ -136,13 +137,13 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
 
 
 class TissueLoad(NamedTuple):
-    """What tissue bears where it bears most, averaged at nodes.
+    """Largest load of the tissue, averaged at nodes.
 
     Fields:
         pressure: largest contact pressure, per undeformed area [Pa]; 0 without contact
-        pressure_node: where
+        pressure_node: its node
         strain: largest |lambda - 1| of the principal stretches
-        strain_node: where
+        strain_node: its node
     """
 
     pressure: float
@@ -166,8 +167,8 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
     add_gradients(model.node_rest_position, state.node_position, model.tet_nodes, gradient)
     gradient /= 4.0 * model.node_rest_volume[:, None, None]
     squared = matmul(gradient.transpose(0, 2, 1), gradient)
-    # Eigenvalues lie within the mean +- twice the root of a sixth of the deviator's square (Smith 1961): nodes whose
-    # bound is below a strain that is known need no closer look.
+    # Eigenvalues lie within the mean +- twice the root of a sixth of the deviator's square (Smith 1961): this bound
+    # leaves few nodes for the eigenvalues.
     mean = np.trace(squared, axis1=1, axis2=2) / 3.0
     spread = 2.0 * np.sqrt(np.maximum((squared * squared).sum(axis=(1, 2)) - 3.0 * (mean * mean), 0.0) / 6.0)
     bound = np.maximum(np.sqrt(mean + spread) - 1.0, 1.0 - np.sqrt(np.maximum(mean - spread, 0.0)))
@@ -182,14 +183,14 @@ def _principal_strain(squared: FloatArray) -> FloatArray:
 
 
 def volume_ratios(model: OrganModel, state: OrganState) -> FloatArray:
-    """Volume of each tet over its volume at rest, J = V / V0, negative where it is inside out, shape (n_tet,)."""
+    """Volume of each tet over its volume at rest, J = V / V0, negative for a tet inside out, shape (n_tet,)."""
     ratio = np.empty(len(model.tet_nodes))
     fill_volume_ratios(state.node_position, model.tet_nodes, model.tet_rest_volume, ratio)
     return ratio
 
 
 def inverted_tets(model: OrganModel, state: OrganState) -> IntArray:
-    """Indices of the tets that are inside out, flat or not finite (J > 0 does not hold), shape (n_inverted,)."""
+    """Indices of the tets inside out, flat or not finite (J > 0 does not hold), shape (n_inverted,)."""
     return np.flatnonzero(~(volume_ratios(model, state) > 0.0)).astype(np.int32)
 
 

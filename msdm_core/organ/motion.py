@@ -1,8 +1,8 @@
-"""Prescribed motion of what holds an organ, as by breathing: anchored nodes, foundations and supports follow signals.
+"""Prescribed motion of the ground of an organ, as in breathing: anchored nodes, foundations and supports.
 
-A motion m displaces the ground at a place X by s_m(t) d_m(X). The state holds its signal s_m and rate, which whoever
-advances the organ sets; kernels move the ground in each substep and count the work that it does. Damping
-by mass (alpha) acts on velocities relative to the ground, as the tissue around an organ moves with it.
+A motion m displaces the ground at a place X by s_m(t) d_m(X). The caller sets its signal s_m and rate in the state;
+kernels move the ground in each substep and count its work. Damping by mass (alpha) acts on velocities relative to the
+ground, as the tissue around an organ moves with it.
 """
 
 import math
@@ -29,9 +29,9 @@ class Motion:
 
     Args:
         name: used in messages.
-        displacement: d_m where the motion is largest [m].
-        centre: of the part that moves [m]; None where all of the ground moves alike.
-        reach: distance from the centre beyond which nothing moves [m]: d_m falls as (1 - r^2 / reach^2)^2.
+        displacement: largest d_m [m].
+        centre: of the moving part [m]; None if all of the ground moves alike.
+        reach: radius of the moving part [m]: d_m falls as (1 - r^2 / reach^2)^2.
     """
 
     name: str
@@ -70,13 +70,13 @@ def motion_fields(
     foundation_nodes: ArrayLike,
     support_position: FloatArray,
 ) -> dict[str, Any]:
-    """The fields of an OrganModel that describe how its ground moves.
+    """Fields of an OrganModel for the motions of its ground.
 
     Args:
         motions: of the ground.
         points: rest positions of the nodes [m], shape (n_node, 3).
-        anchored: the nodes held fixed, shape (n_node,).
-        foundation_nodes: nodes that foundations hold, shape (n_held,).
+        anchored: True for the nodes held fixed, shape (n_node,).
+        foundation_nodes: nodes on foundations, shape (n_held,).
         support_position: of the supports [m], shape (n_support, 3).
 
     Raises:
@@ -92,8 +92,8 @@ def motion_fields(
         "motion_support_shift": support_position,
     }
     fields: dict[str, Any] = {
-        field: np.array([motion.shift(where) for motion in motions]).reshape(len(motions), len(where), 3)
-        for field, where in places.items()
+        field: np.array([motion.shift(origin) for motion in motions]).reshape(len(motions), len(origin), 3)
+        for field, origin in places.items()
     }
     fields["motion_node_shift"] = np.pad(fields["motion_node_shift"], ((0, 0), (0, 0), (0, 1)))
     fields["motion_anchored_nodes"] = np.flatnonzero(anchored if motions else False)
@@ -103,9 +103,9 @@ def motion_fields(
 
 
 def place_on_ground(model: OrganModel, state: OrganState, signal: ArrayLike, rate: ArrayLike) -> None:
-    """Move an organ at rest with its ground to where signals (n_motion,) have it, at their rates (n_motion,) [1/s].
+    """Move an organ at rest with its ground to signals (n_motion,), at their rates (n_motion,) [1/s].
 
-    All nodes go with the ground below them: exact where all of the ground moves alike and evenly.
+    All nodes move with the ground: exact for a ground that moves alike everywhere and evenly.
     """
     state.motion[:, SIGNAL] = signal
     state.motion[:, RATE] = state.motion[:, RATE_BEFORE] = rate

@@ -1,7 +1,4 @@
-"""The largest stable step of an organ, and the mass that makes a longer one stable.
-
-The step follows from springs, volume term, damping, supports and contact together.
-"""
+"""Stable step of an organ, from springs, volume term, damping, supports and contact; mass scaling for a longer step."""
 
 import math
 from bisect import bisect_left
@@ -20,25 +17,23 @@ from msdm_core.mesh.tet_mesh import FloatArray
 
 # Relative accuracy of the largest eigenvalue: 1 % of the step. Lanczos converges from below, so it is added back.
 EIGENVALUE_TOLERANCE = 0.02
-# Vectors of the Lanczos basis, and those that a restart keeps.
+# Vectors of the Lanczos basis, and of them after a restart.
 LANCZOS_VECTORS, LANCZOS_KEPT = 12, 6
 RESTARTS_MOST = 1000
-# What stiffening adds to the tangent is integrated implicitly, by so many sweeps at most; larger tangents than these
-# hold shorten the step.
+# Largest number of sweeps of the implicit integration of stiffening, and the tangent up to which they suffice; a larger
+# tangent shortens the step.
 SWEEPS_MOST = 12
 HELD_TANGENT = SWEEPS_MOST / SWEEPS_PER_TANGENT
-# A step is found to this part of its upper bound.
+# Resolution of the stable step, as a share of its upper bound.
 ROOT_PARTS = 2**40
 
 
 def apply_stiffness(
     model: OrganModel, displacement: FloatArray, force: FloatArray, spring_stiffness: FloatArray | None = None
 ) -> None:
-    """Fill `force` with the linearised forces at rest, K u [N], of a displacement u [m]; both (n_node, 3).
+    """Fill `force` with the forces K u [N] of tissue and foundations, linearised at rest, of u [m]; both (n_node, 3).
 
-    K is that of the tissue and of its foundations.
-
-    The springs have the stiffness of the model, in equilibrium, or the one given [N/m], (n_spring,).
+    Springs have the stiffness given [N/m] (n_spring,), left out that of the model in equilibrium.
     """
     stiffness = model.spring_stiffness if spring_stiffness is None else spring_stiffness
     multiply_stiffness(
@@ -51,11 +46,10 @@ def apply_stiffness(
 
 
 def explicit_stiffness(model: OrganModel) -> FloatArray:
-    """Largest tangent of each spring that the step must bear, Maxwell arms included [N/m], shape (n_spring,).
+    """Largest explicitly integrated tangent of each spring, Maxwell arms included [N/m], shape (n_spring,).
 
-    What stiffening adds beyond STEEP_EXCESS is integrated implicitly (`squeeze_kernels.hold_steep`), which holds a
-    tangent of up to HELD_TANGENT times that at rest; a larger cap c counts as c / HELD_TANGENT, so that the step is
-    shorter by its root.
+    The rise beyond STEEP_EXCESS is integrated implicitly (`squeeze_kernels.hold_steep`), up to HELD_TANGENT times the
+    tangent at rest; a larger cap c counts as c / HELD_TANGENT, so that the step is shorter by its root.
     """
     stiffness = model.spring_stiffness
     if model.stiffens:
@@ -65,9 +59,8 @@ def explicit_stiffness(model: OrganModel) -> FloatArray:
 
 
 def steep_sweeps(tangent_cap: float) -> int:
-    """Sweeps of `squeeze_kernels.hold_steep` that hold springs up to a tangent over that at rest; an even number."""
-    wanted = 2 * math.ceil(0.5 * SWEEPS_PER_TANGENT * tangent_cap)
-    return min(max(wanted, SWEEPS_LEAST), SWEEPS_MOST)
+    """Even number of sweeps of `squeeze_kernels.hold_steep` for springs up to a tangent over that at rest."""
+    return min(max(2 * math.ceil(0.5 * SWEEPS_PER_TANGENT * tangent_cap), SWEEPS_LEAST), SWEEPS_MOST)
 
 
 def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = None) -> float:
@@ -77,7 +70,7 @@ def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = Non
 
     Args:
         model: the organ.
-        node_stiffness: stiffness that holds each node, such as contact's [N/m], shape (n_node,).
+        node_stiffness: of each node against the ground, for instance by contact [N/m], shape (n_node,).
     """
     shape = model.node_rest_position.shape
     scale = np.sqrt(model.node_inverse_mass)[:, None]
@@ -95,8 +88,8 @@ def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = Non
     if count < 60:
         matrix = np.column_stack([apply(column) for column in np.eye(count)])
         return math.sqrt(max(float(eigh(0.5 * (matrix + matrix.T))[0][-1]), 0.0))
-    # A fixed start without symmetry: the same organ gives the same step, to the bit. Of more than 48 000 nodes some
-    # angles are beyond those that `sin` takes.
+    # A fixed start without symmetry: the same organ gives the same step, to the bit. With more than 48 000 nodes some
+    # angles exceed the range of `sin`.
     start = sin(np.fmod(1.0 + 1.7 * power(np.arange(count), 1.1), ANGLE_MOST))
     return math.sqrt(_largest_eigenvalue(apply, start) * (1.0 + EIGENVALUE_TOLERANCE))
 
@@ -109,49 +102,49 @@ def _largest_eigenvalue(apply: Callable[[FloatArray], FloatArray], start: FloatA
     """
     basis = np.zeros((LANCZOS_VECTORS + 1, len(start)))
     projected = np.zeros((LANCZOS_VECTORS, LANCZOS_VECTORS))
-    begin = apply(start)
-    basis[0], first, rest = begin / norm(begin), 0, 0.0
+    image = apply(start)
+    basis[0], first, residual = image / norm(image), 0, 0.0
     for _ in range(RESTARTS_MOST):
         for last in range(first, LANCZOS_VECTORS):
-            pushed = apply(basis[last])
-            known = basis[: last + 1]
+            image = apply(basis[last])
+            span = basis[: last + 1]
             for _ in range(2):
-                share = dot(known, pushed)
+                share = dot(span, image)
                 projected[last, last] += share[last]
-                pushed = pushed - matmul(share, known)
-            rest = float(norm(pushed))
-            if rest == 0.0:
+                image = image - matmul(share, span)
+            residual = float(norm(image))
+            if residual == 0.0:
                 return float(eigh(projected[: last + 1, : last + 1])[0][-1])
-            basis[last + 1] = pushed / rest
+            basis[last + 1] = image / residual
             if last + 1 < LANCZOS_VECTORS:
-                projected[last, last + 1] = projected[last + 1, last] = rest
+                projected[last, last + 1] = projected[last + 1, last] = residual
         values, vectors = eigh(projected)
-        left = rest * vectors[-1, -LANCZOS_KEPT:]
-        if abs(left[-1]) <= EIGENVALUE_TOLERANCE * abs(values[-1]):
+        errors = residual * vectors[-1, -LANCZOS_KEPT:]
+        if abs(errors[-1]) <= EIGENVALUE_TOLERANCE * abs(values[-1]):
             return float(values[-1])
         first = LANCZOS_KEPT
         basis[:first] = matmul(vectors[:, -first:].T, basis[:-1])
         basis[first] = basis[-1]
         projected[:] = 0.0
         projected[range(first), range(first)] = values[-first:]
-        projected[first, :first] = projected[:first, first] = left
+        projected[first, :first] = projected[:first, first] = errors
     raise OrganError(
-        f"the largest frequency of the organ was not found in {RESTARTS_MOST} restarts of Lanczos' method: are masses "
-        "and stiffnesses finite?"
+        f"Lanczos' method did not converge to the largest frequency of the organ in {RESTARTS_MOST} restarts: are "
+        "masses and stiffnesses finite?"
     )
 
 
 def contact_node_area(model: OrganModel) -> FloatArray:
-    """Surface area that belongs to each node, a third of each triangle around it [m^2], shape (n_node,)."""
+    """Surface area of each node, a third of each triangle around it [m^2], shape (n_node,)."""
     thirds = np.repeat(model.surface_rest_area / 3.0, 3)
     return np.bincount(model.surface_triangles.ravel(), thirds, len(model.node_mass)).astype(np.float64)
 
 
 def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> tuple[float, float]:
-    """Most that contact holds a node with in a substep over its mass, and the share of it that is stiffness.
+    """Largest hold h of a node by contact, and the share of stiffness in it.
 
-    h = dt max(k_p dt + c_p, k_t dt) A / m, where A is a third of the area of each triangle around the node and k_t
-    counts where there is friction. Faces that meet in an edge or a corner count together, whatever their directions.
+    h = dt max(k_p dt + c_p, k_t dt) A / m, with A a third of the area of each triangle around the node and k_t = 0
+    without friction. Faces at a common edge or corner add up, independent of their directions.
     """
     across = contact.tangential_stiffness if contact.friction > 0.0 else 0.0
     held = max(contact.stiffness * dt + contact.damping, across * dt)
@@ -160,14 +153,13 @@ def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> tuple[flo
 
 
 def contact_excess(hold: float, share: float = 1.0) -> float:
-    """What implicit contact leaves of a hold h for the step to bear, of a limit of 4; 0 for h up to 7.
+    """Part of the hold h of implicit contact that still limits the explicit step, of the limit 4; 0 for h <= 7.
 
-    A motion that contact holds with k <= h (over its mass, times dt^2, as all here) gets its stiffness, a share of k,
-    as it is at the start of the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k)
-    of a velocity v, where R = prod (1 - w_j (1 + k) / (1 + h)) over the factors w_j of the sweeps. That is a mass of
-    Q = (1 + k) / (1 + k R), with which symplectic Euler is stable where this stiffness and what the organ itself holds
-    with, t, are share k + t <= 2 (1 + Q). So t must stay below 4 less the largest share k - 2 (Q - 1). Damping alone
-    (share 0) asks for nothing.
+    Stiffness is over mass and times dt^2 here. A motion with the hold k <= h gets the force of its stiffness, a share
+    of k, at the start of the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k) of
+    a velocity v, with R = prod (1 - w_j (1 + k) / (1 + h)) over the factors w_j of the sweeps. This acts as a mass of
+    Q = (1 + k) / (1 + k R): symplectic Euler is stable for share k + t <= 2 (1 + Q), with t the stiffness of the organ
+    itself. So t must stay below 4 less the largest share k - 2 (Q - 1). Pure damping (share 0) leaves 0.
     """
     held = hold * np.linspace(0.0, 1.0, 1001)
     left = np.prod([1.0 - factor * (1.0 + held) / (1.0 + hold) for factor in SWEEPS], axis=0)
@@ -177,8 +169,8 @@ def contact_excess(hold: float, share: float = 1.0) -> float:
 def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) -> float:
     """Stable step of symplectic Euler for one mode, v' = e^(-alpha dt) v - dt (w^2 x + (beta w^2 + drag) v) [s].
 
-    The characteristic polynomial leaves the unit circle at z = -1, where
-    2 (1 + e^(-alpha dt)) = 2 dt (beta w^2 + drag) + w^2 dt^2; without damping this is dt = 2 / w.
+    A root of the characteristic polynomial leaves the unit circle at z = -1:
+    2 (1 + e^(-alpha dt)) = 2 dt (beta w^2 + drag) + w^2 dt^2; without damping dt = 2 / w.
     """
     if omega == 0.0 and drag_rate == 0.0:
         return math.inf
@@ -194,11 +186,10 @@ def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) 
 def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     """Largest stable step [s]: springs, volume term, alpha, beta, supports, and contact of instruments if given.
 
-    Supports hold and drag each node with `support_hold`. Contact is implicit, with its damping and its friction: it
-    costs no more than `contact_excess` of `contact_hold`. The step is stable where what the organ takes of the limit,
-    at most (dt / stable_step)^n of it (n = 2, with beta or damped supports 1), and this excess together stay below
-    2 (1 + e^(-alpha dt)). The guard of the shapes' axes is implicit and counts nothing; beta damps the organ alone.
-    The organ is linearised at rest: stretched by 20 % it bears 0.92 to 0.96 of this step.
+    Supports hold and drag each node with `support_hold`. Contact is implicit, with its damping and its friction, and
+    takes `contact_excess` of the limit 2 (1 + e^(-alpha dt)) at most; the organ takes at most (dt / stable_step)^n of
+    it (n = 2, with beta or damped supports 1). The implicit guard of the shapes' axes takes nothing; beta damps the
+    organ alone. The organ is linearised at rest: stretched by 20 % it is stable up to 0.92 to 0.96 of this step.
     """
     own = model.stable_step
     if contact is None or not math.isfinite(own) or not np.any(model.node_inverse_mass):
@@ -216,7 +207,7 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
 
 
 def _root_below(ceiling: float, margin: Callable[[float], float]) -> float:
-    """The largest step [s] without a negative margin, which falls with the step: `ceiling`, or just below the root."""
+    """Largest step [s] without a negative margin (falling with the step): `ceiling`, or just below the root."""
     if margin(ceiling) >= 0.0:
         return ceiling
     # scipy.optimize would take a fifth of a second to import, a sixth of the time to the first step.
@@ -232,9 +223,9 @@ def own_step(model: OrganModel) -> float:
 
 
 def support_hold(model: OrganModel) -> tuple[FloatArray, FloatArray]:
-    """The most that supports can hold each node with in any direction [N/m] and drag it with [N s/m], (n_node,) each.
+    """Largest stiffness [N/m] and drag [N s/m] of supports on each node in any direction, (n_node,) each.
 
-    One support holds a node of area A with k_p A along its normal and less across it; all of them may meet in it.
+    A support holds a node of area A with k_p A along its normal and less across it; all of them may touch it.
     """
     area = np.zeros(len(model.node_mass))
     area[model.support_nodes] = len(model.support_kind) * model.support_area
@@ -242,7 +233,7 @@ def support_hold(model: OrganModel) -> tuple[FloatArray, FloatArray]:
 
 
 def _held_step(model: OrganModel, held: FloatArray, drag: FloatArray) -> float:
-    """Stable step [s] with what holds each node [N/m] and drags it [N s/m], shape (n_node,) each."""
+    """Stable step [s] with a stiffness [N/m] and drag [N s/m] on each node, shape (n_node,) each."""
     most_drag = float((drag * model.node_inverse_mass).max())
     dt = step_limit(largest_frequency(model, held), model.alpha, model.beta, most_drag)
     if (not drag.any() and model.beta == 0.0) or not math.isfinite(dt):
@@ -257,22 +248,22 @@ def _held_step(model: OrganModel, held: FloatArray, drag: FloatArray) -> float:
 
 # ---- mass scaling -------------------------------------------------------------------------------------------------
 
-# Largest share of the organ's mass that may be added.
+# Largest added mass, as a share of the organ's.
 ADDED_SHARE_LIMIT = 0.1
-# Relative accuracy of w^2 in the bisection, and the most steps of a tenth by which the first guess is lowered.
+# Relative accuracy of w^2 in the bisection; largest number of reductions of the first guess by a tenth.
 FREQUENCY_TOLERANCE = 2.0**-6
 LOWERINGS = 20
 
 
 def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None) -> OrganModel:
-    """The organ with mass added to those nodes that limit the step, so that `step` [s] is stable; itself if it is.
+    """The organ with mass added to the nodes that limit the step, so that `step` [s] is stable; itself if it is.
 
-    A node of stiffness k_i (the largest eigenvalue of its own 3 x 3 block of K) gets the mass
-    max(m_i, k_i / w^2), with the largest w, found by bisection to 1 %, for which `stable_dt` reaches the step.
+    A node of stiffness k_i (the largest eigenvalue of its own 3 x 3 block of K) gets the mass max(m_i, k_i / w^2), with
+    w by bisection to 1 % the largest for a `stable_dt` of at least the step.
 
     Raises:
-        OrganError: an organ under gravity (the added mass would have weight), or one that needs more than a tenth of
-            its mass; says how much.
+        OrganError: an organ under gravity (the added mass would have weight), or more added mass than a tenth of the
+            organ's; names the share.
     """
     before = stable_dt(model, contact)
     if before >= step:
@@ -285,9 +276,6 @@ def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None
     free = model.node_inverse_mass > 0.0
     high = float((stiffness * model.node_inverse_mass).max())
 
-    def is_stable(trial: OrganModel) -> bool:
-        return stable_dt(trial, contact) >= step
-
     def with_frequency(square: float) -> OrganModel:
         return _with_mass(model, np.where(free, np.maximum(model.node_mass, stiffness / square), model.node_mass))
 
@@ -295,14 +283,14 @@ def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None
     low, scaled = high * (before / step) * (before / step), model
     for _ in range(LOWERINGS):
         trial = with_frequency(low)
-        if is_stable(trial):
+        if stable_dt(trial, contact) >= step:
             scaled = trial
             break
         low, high = 0.9 * low, low
     while scaled is not model and high - low > FREQUENCY_TOLERANCE * high:
         middle = 0.5 * (low + high)
         trial = with_frequency(middle)
-        if is_stable(trial):
+        if stable_dt(trial, contact) >= step:
             low, scaled = middle, trial
         else:
             high = middle
@@ -327,7 +315,7 @@ def _with_mass(model: OrganModel, mass: FloatArray) -> OrganModel:
 
 
 def _node_stiffness(model: OrganModel) -> FloatArray:
-    """Stiffness of each node while all others are fixed, with what holds it [N/m], shape (n_node,)."""
+    """Stiffness of each node with all others fixed, supports and foundations included [N/m], shape (n_node,)."""
     block = np.zeros((len(model.node_mass), 3, 3))
     span = model.node_rest_position[model.spring_nodes]
     along = (span[:, 1] - span[:, 0]) / model.spring_rest_length[:, None]

@@ -1,4 +1,4 @@
-"""Advancing an organ: contact shapes of tools, symplectic Euler substeps against them, messages about faults."""
+"""Time integration of an organ: contact shapes of tools, symplectic Euler substeps, messages about faults."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,15 +32,15 @@ def round_shapes(
     centre: ArrayLike | None = None,
     twist: ArrayLike | None = None,
 ) -> ContactShapes:
-    """Contact shapes, all points within a radius of a core: equal ends make a ball, a span makes a rounded box.
+    """Contact shapes, all points within a radius of a core: capsules, balls (equal ends), rounded boxes (with a span).
 
     Args:
         ends: of each core's axis [m], (n_shape, 2, 3).
         radius: [m], (n_shape,).
-        span: from the axis to the border of a rounded box's core, square to the axis [m], (n_shape, 3); default 0.
-        friction: Coulomb coefficient over that of the contact law, (n_shape,) or one for all.
-        tool: which tool carries each shape, (n_shape,); default the first.
-        centre: each tool's centre of mass [m], (n_tool, 3); default the middle of the first shape that it carries.
+        span: from the axis to the border of a rounded box's core, normal to the axis [m], (n_shape, 3); default 0.
+        friction: Coulomb coefficient over that of the contact law, (n_shape,) or a number for all.
+        tool: index of each shape's tool, (n_shape,); default 0.
+        centre: each tool's centre of mass [m], (n_tool, 3); default the middle of its first shape.
         twist: of each tool [m/s, rad/s], (n_tool, 6); default 0.
     """
     axes = np.array(ends, dtype=np.float64).reshape(-1, 2, 3)
@@ -74,24 +74,22 @@ def advance(
     shapes: ContactShapes = NO_SHAPES,
     contact: ContactLaw = NO_CONTACT,
 ) -> FloatArray:
-    """Advance an organ in place by `substep_count` symplectic Euler steps of dt [s], shapes moving along their twist.
+    """Advance an organ in place by `substep_count` symplectic Euler steps of dt [s]; shapes move along their twist.
 
     Returns:
-        The mean wrench on each tool over the substeps, torque about its centre of mass at the start: force [N], torque
-        [N m], shape (n_tool, 6).
+        Mean wrench on each tool over the substeps, force [N] and torque [N m] about its centre of mass at the start,
+        shape (n_tool, 6).
 
     Raises:
-        OrganError: dt above the organ's stable step (that with contact where there are shapes), a state of another
-            organ, contact memory that does not fit the shapes.
+        OrganError: dt above the organ's stable step (with contact if there are shapes), a state of another organ,
+            contact memory that does not fit the shapes.
         OrganDivergedError: an inverted tet (named, with its volume ratio) or a number that is not finite.
     """
-    touching = len(shapes.shape_radius) > 0
     _check_state(model, state, len(shapes.shape_radius))
-    limit = _contact_step(model, contact) if touching else model.stable_step
+    limit = _contact_step(model, contact) if len(shapes.shape_radius) else model.stable_step
     if not 0.0 < dt <= limit:
-        with_contact = " with contact" if touching else ""
         raise OrganError(
-            f"dt is {dt:g} s; it must be above 0 and at most the stable step{with_contact} {limit:.4g} s: "
+            f"dt is {dt:g} s; it must be above 0 and at most the stable step {limit:.4g} s (less with contact shapes): "
             "use more, shorter substeps"
         )
     return advance_or_raise(model, state, dt, substep_count, shapes, contact)
@@ -118,12 +116,12 @@ def advance_or_raise(
 
 
 def _check_state(model: OrganModel, state: OrganState, shape_count: int) -> None:
-    """Kernels look at no array's bounds: a state of another organ must not get there."""
-    points, supports = (
-        len(model.surface_triangles) * QUADRATURE_COUNT,
-        (len(model.support_nodes), len(model.support_kind)),
-    )
-    organ = (len(model.node_mass), points, *supports, len(model.motion_node_shift))
+    # Kernels check no array's bounds.
+    point_count = len(model.surface_triangles) * QUADRATURE_COUNT
+    organ = (
+        len(model.node_mass), point_count, len(model.support_nodes), len(model.support_kind),
+        len(model.motion_node_shift),
+    )  # fmt: skip
     memory = (state.contact_engaged.shape[1], *state.support_stretch.shape[:2], len(state.motion))
     if (len(state.node_position), *memory) != organ or shape_count > len(state.contact_engaged):
         raise OrganError(
@@ -137,7 +135,7 @@ _contact_step_known: list[tuple[OrganModel, ContactLaw, float]] = []
 
 
 def _contact_step(model: OrganModel, contact: ContactLaw) -> float:
-    """`stable_dt` with contact, remembered for the last organ: it takes as long as many steps."""
+    """`stable_dt` with contact, cached for the last organ: it takes as long as many steps."""
     for known, law, step in _contact_step_known:
         if known is model and law == contact:
             return step
@@ -155,7 +153,7 @@ def advance_organ(
     wrench: FloatArray,
     response: ToolResponse | None = None,
 ) -> int:
-    """`advance` without its checks, for loops that checked once: fills `wrench`, returns a FAULT_ code.
+    """`advance` without its checks, for loops: fills `wrench`, returns a FAULT_ code.
 
     With a `response` the force of the tissue changes `shapes.tool_twist` within the call.
     """
@@ -167,18 +165,20 @@ def advance_organ(
 
 
 def unyielding(tool_count: int) -> ToolResponse:
-    """The response of tools that follow their twist whatever force the tissue exerts."""
+    """Response of tools with a prescribed twist: no force of the tissue changes it."""
     return ToolResponse(*(np.zeros((tool_count, *shape)) for shape in ((6,), (tool_count, 6, 6), (6,), (6,))))
 
 
 def describe_fault(model: OrganModel, state: OrganState, fault: int) -> str:
-    """One sentence on a FAULT_ code: what happened and where."""
+    """Message for a FAULT_ code, with the place of the fault."""
     bad = np.flatnonzero(~np.isfinite(state.node_position).all(axis=1) | ~np.isfinite(state.node_velocity).all(axis=1))
     if fault == FAULT_INVERTED_TET and not bad.size:
         ratios = volume_ratios(model, state)
         tet = int(np.argmin(ratios))
-        what = f"tet {tet} turned inside out: volume ratio {ratios[tet]:.3g}, it must stay above 0"
-        return f"{what}: press less deep, use more substeps, smaller cells or a higher Poisson's ratio"
+        return (
+            f"tet {tet} turned inside out: volume ratio {ratios[tet]:.3g}, it must stay above 0: press less deep, use "
+            "more substeps, smaller cells or a higher Poisson's ratio"
+        )
     if fault == FAULT_CONTACT_LOST:
         shape, triangle = state.contact_passed.tolist()
         return (

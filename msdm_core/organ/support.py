@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
-from msdm_core.errors import OrganError
+from msdm_core.errors import OrganError, require_not_negative, require_positive
 from msdm_core.kernels.support_kernels import BOX, CAPSULE, PLANE, SPHERE
 from msdm_core.mesh.quality import surface_cell
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, area_vectors
 
 Vector = tuple[float, float, float]
 
 KINDS = {"plane": PLANE, "sphere": SPHERE, "capsule": CAPSULE, "box": BOX}
-# What the numbers of `Support.size` are, as in MuJoCo [m].
+# Meaning of the numbers of `Support.size`, as in MuJoCo [m].
 SIZES = {
     "plane": (),
     "sphere": ("radius",),
@@ -28,13 +28,13 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Support:
-    """A fixed solid that an organ rests on; kinds, sizes and frames as in MuJoCo.
+    """A fixed solid below an organ; kinds, sizes and frames as in MuJoCo.
 
     Args:
         name: used in messages and pictures.
         kind: "plane" (solid below, infinite), "box", "sphere" or "capsule".
         position: of a plane's point, of the others' middle [m].
-        axis: where its z axis points, turned there the shortest way: a plane's normal, a capsule's axis.
+        axis: direction of its z axis, reached by the shortest rotation: a plane's normal, a capsule's axis.
         rotation: the whole orientation as a quaternion (w, x, y, z), in place of `axis`.
         size: empty for a plane; radius; radius and half length; three half sizes [m].
         friction: Coulomb coefficient between it and the organ.
@@ -49,27 +49,26 @@ class Support:
     friction: float = 0.3
 
     def __post_init__(self) -> None:
-        what = f"support {self.name!r}"
+        label = f"support {self.name!r}"
         if not self.name or self.kind not in KINDS:
-            raise OrganError(f"{what}: kind is {self.kind!r}; give a name and one of the kinds {', '.join(KINDS)}")
-        _require_numbers(f"{what}: position", self.position, 3)
+            raise OrganError(f"{label}: kind is {self.kind!r}; give a name and one of the kinds {', '.join(KINDS)}")
+        _require_numbers(f"{label}: position", self.position, 3)
         if self.axis is not None and self.rotation is not None:
-            raise OrganError(f"{what}: axis and rotation are both given; give one of them")
+            raise OrganError(f"{label}: axis and rotation are both given; give one of them")
         for entry, count in (("axis", 3), ("rotation", 4)):
             value = getattr(self, entry)
             if value is not None:
-                _require_numbers(f"{what}: {entry}", value, count)
+                _require_numbers(f"{label}: {entry}", value, count)
                 if float(norm(value)) < 1e-9:
-                    raise OrganError(f"{what}: {entry} is {value}; it must not be zero")
-        _require_numbers(f"{what}: size", self.size, len(SIZES[self.kind]), SIZES[self.kind])
-        if not all(number > 0.0 for number in self.size):
-            raise OrganError(f"{what}: size is {self.size} m; every number must be above 0")
-        if not (math.isfinite(self.friction) and self.friction >= 0.0):
-            raise OrganError(f"{what}: friction is {self.friction:g}; it must be finite and at least 0")
+                    raise OrganError(f"{label}: {entry} is {value}; it must not be zero")
+        _require_numbers(f"{label}: size", self.size, len(SIZES[self.kind]), SIZES[self.kind])
+        for length in self.size:
+            require_positive(f"{label}: size", length, "m")
+        require_not_negative(f"{label}: friction", self.friction)
 
     @property
     def quaternion(self) -> FloatArray:
-        """Its orientation (w, x, y, z) of length 1, shape (4,)."""
+        """Orientation (w, x, y, z) of length 1, shape (4,)."""
         if self.rotation is not None:
             return np.array(self.rotation) / float(norm(self.rotation))
         x, y, z = np.array(self.axis or (0.0, 0.0, 1.0)) / float(norm(self.axis or (1.0,)))
@@ -80,7 +79,7 @@ class Support:
 
     @property
     def frame(self) -> FloatArray:
-        """Its axes in the world, one a column, shape (3, 3)."""
+        """Axes in the world as columns, shape (3, 3)."""
         w, x, y, z = self.quaternion
         return np.array(
             [
@@ -91,7 +90,7 @@ class Support:
         )
 
     def reach(self, direction: FloatArray) -> float:
-        """Its largest coordinate along a unit direction [m]; infinite for a plane."""
+        """Largest coordinate along a unit direction [m]; infinite for a plane."""
         along = matmul(direction, self.frame)
         if self.kind == "plane":
             return math.inf
@@ -104,7 +103,7 @@ class Support:
 
 @dataclass(frozen=True)
 class SupportLaw:
-    """Contact law of supports, per unit of the surface area of the organ; sticking friction is half as stiff.
+    """Contact law of supports, per area of the organ's surface; static friction is half as stiff.
 
     Args:
         stiffness: pressure per penetration, k_p [N/m^3].
@@ -115,26 +114,24 @@ class SupportLaw:
     damping: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
-            raise OrganError(f"supports: stiffness is {self.stiffness:g} N/m^3; it must be finite and above 0")
-        if not (math.isfinite(self.damping) and self.damping >= 0.0):
-            raise OrganError(f"supports: damping is {self.damping:g} N s/m^3; it must be finite and at least 0")
+        require_positive("supports: stiffness", self.stiffness, "N/m^3")
+        require_not_negative("supports: damping", self.damping, "N s/m^3")
 
 
 def support_fields(
     supports: Sequence[Support], law: SupportLaw, mesh: TetMesh, surface: IntArray, anchored: NDArray[np.bool_]
 ) -> dict[str, Any]:
-    """The fields of an OrganModel that describe its supports.
+    """Fields of an OrganModel for its supports.
 
     Args:
         supports: the solids.
         law: their contact law.
         mesh: the organ.
-        surface: its triangles that may be touched, shape (n_surface, 3).
-        anchored: the nodes held fixed, shape (n_node,); supports do not act on them.
+        surface: its triangles open to contact, shape (n_surface, 3).
+        anchored: True for the nodes held fixed, shape (n_node,); supports do not act on them.
 
     Raises:
-        OrganError: two supports of one name, one too small for the organ's cells to feel, or no surface to touch.
+        OrganError: two supports of one name, a support smaller than the organ's cells, or no surface to touch.
     """
     names = [support.name for support in supports]
     for name in names:
@@ -147,8 +144,7 @@ def support_fields(
         )
     if supports:
         _check_sizes(supports, surface_cell(mesh, surface))
-    corners = mesh.points[surface]
-    area = 0.5 * norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = norm(area_vectors(mesh.points[surface]), axis=1)
     node_area = np.bincount(surface.ravel(), np.repeat(area / 3.0, 3), mesh.node_count)
     nodes = np.flatnonzero((node_area > 0.0) & ~anchored) if supports else np.zeros(0, dtype=np.int64)
     fields = {
@@ -170,7 +166,7 @@ def support_fields(
 
 
 def _check_sizes(supports: Sequence[Support], cell: float) -> None:
-    """Refuse solids small enough to fit between nodes: contact acts on nodes only."""
+    # Contact acts on nodes only: a small solid fits between them.
     for support in supports:
         widths = support.size[:1] if support.kind == "capsule" else support.size
         if widths and min(widths) < cell:
@@ -181,7 +177,7 @@ def _check_sizes(supports: Sequence[Support], cell: float) -> None:
             )
 
 
-def _require_numbers(what: str, values: Sequence[float], count: int, meaning: tuple[str, ...] = ()) -> None:
-    if len(values) != count or not all(math.isfinite(value) for value in values):
+def _require_numbers(quantity: str, values: Sequence[float], count: int, meaning: tuple[str, ...] = ()) -> None:
+    if len(values) != count or not all(map(math.isfinite, values)):
         means = f" ({', '.join(meaning)})" if meaning else ""
-        raise OrganError(f"{what} is {values}; it must be {count} finite numbers{means}")
+        raise OrganError(f"{quantity} is {values}; it must be {count} finite numbers{means}")

@@ -21,16 +21,16 @@ class Organ:
 
     files: tyro.conf.Positional[tuple[Path, ...]]
     """A label image (nii, nii.gz, nrrd, dcm); or closed surfaces (STL, OBJ, PLY), the organ first, then a file for each
-    region in it, which names the region; or one file of tets (vtu, vtk, msh, mesh)."""
+    region in it, named after the region; or one file of tets (vtu, vtk, msh, mesh)."""
     labels: MaybeText = None
     """NAME=LABEL,...: the labels of an image, or the region tags of tets, the organ first, such as liver=1,lesion=2."""
     length_unit: MaybeText = None
     """Unit of the file: m, cm, mm, or metres per unit as a number; required if the format states none."""
     cell_size: MaybeNumber = None
-    """Cell size of the lattice that fills the organ [m], the same everywhere, from which the tip follows; default:
-    cells follow from the tip, fine at the pressed face and coarse elsewhere."""
+    """Cell size of the organ's lattice [m], the same everywhere; the tip follows from it. Default: cells follow from
+    the tip, fine at the pressed face and coarse elsewhere."""
     tip_radius: MaybeNumber = None
-    """Radius of the ball tip [m]; default: 5 mm, or 6 mm for organs above 500 ml, as passes a trocar of 12 mm."""
+    """Radius of the ball tip [m]; default: 5 mm, or 6 mm for organs above 500 ml, suitable for a trocar of 12 mm."""
     press_depth: MaybeNumber = None
     """Depth of a press [m]; default: 7/12 of the tip's radius."""
     out: MaybePath = None
@@ -44,12 +44,12 @@ class Organ:
     mend: bool = False
     """Close holes, resolve self-intersections and fill cavities, and report it."""
     remesh: bool = False
-    """Fill the surfaces of a file of tets anew, with cells that suit the tip; else its tets are kept."""
+    """Fill the surfaces of a file of tets anew, with cells suited to the tip; else its tets are kept."""
     mesher: MaybeText = None
     """lattice (default), or tetwild for conforming region surfaces (extra `tetwild`)."""
 
     healthy_map: bool = True
-    """Press the healthy organ at every site and write the map, with which SurgSim/PalpateSites-v0 starts at once.
+    """Press the healthy organ at every site and write the map, for an immediate start of SurgSim/PalpateSites-v0.
     Without it the first `gym.make` presses these sites."""
 
     @property
@@ -64,8 +64,8 @@ class Organ:
         """Make an organ, print a summary of it, and with `out` write its mesh, its scenes and its report.
 
         Raises:
-            MeshError: a file that cannot become an organ.
-            ValueError: options that do not go together, or a place that cannot be written.
+            MeshError: a file unusable as an organ.
+            ValueError: conflicting options, or a read-only place.
         """
         from msdm_core.mesh_files import FORMATS, SURFACE_SUFFIXES
         from surgsim_apps.palpate.scene_options import SceneOptions

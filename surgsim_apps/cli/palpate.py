@@ -26,7 +26,7 @@ from surgsim_env.step_progress import StepProgress
 
 @dataclass(frozen=True)
 class Palpate:
-    """Press an organ site by site, map its stiffness, and report where lesions were felt.
+    """Press an organ site by site, map its stiffness, and report the felt lesions.
 
     Lengths are in metres, forces in newtons. Writes palpation.csv, stiffness_map.png and summary.json.
     """
@@ -56,7 +56,7 @@ class Palpate:
 
     @property
     def options(self) -> SceneOptions:
-        """Options that replace values of the scene."""
+        """Replacements of values of the scene."""
         return SceneOptions(
             approach=vector_of("--approach", self.approach),
             press_depth=self.press_depth,
@@ -64,13 +64,13 @@ class Palpate:
         )
 
     def run(self, console: Console) -> int:
-        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the lesions found.
+        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the felt lesions.
 
         Raises:
-            ValueError: options that do not go together, impossible values, a scene file that cannot be read.
+            ValueError: conflicting options, impossible values, an unreadable scene file.
         """
         _check(self)
-        around, asked, below = _around(self), _asked_lesions(self), _asked_below(self)
+        around, lesion_options, below = _around(self), _asked_lesions(self), _asked_below(self)
         scene = load_scene(self.organ) if self.organ else make_scene(self.scene or "liver")
         scene = with_options(scene, self.options)
         names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
@@ -80,8 +80,8 @@ class Palpate:
                 with progress.step("preparing the organ"):
                     anatomy = load_anatomy(scene)
                     lesions = anatomy.demonstration_lesions()
-                    if asked or below:
-                        places = [*asked, *(_below_site(anatomy, *lesion) for lesion in below)]
+                    if lesion_options or below:
+                        places = [*lesion_options, *(_below_site(anatomy, *lesion) for lesion in below)]
                         lesions = [anatomy.lesion_at(*place, f"lesion {n}") for n, place in enumerate(places, start=1)]
                         for lesion in lesions:
                             anatomy.check_inside(lesion)
@@ -114,18 +114,18 @@ def _around(command: Palpate) -> Ball | None:
 
 def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
     """Centre [m], radius [m] and modulus ratio of each --lesion."""
-    asked = []
+    lesions = []
     for text in command.lesion:
         x, y, z, radius, ratio = numbers_of("--lesion", text, "x,y,z,radius,ratio")
         if not ratio > 0.0:
             raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
-        asked.append(((x, y, z), radius, ratio))
-    return asked
+        lesions.append(((x, y, z), radius, ratio))
+    return lesions
 
 
 def _asked_below(command: Palpate) -> list[tuple[int, float, float, float]]:
     """Site, depth of the centre [m], radius [m] and modulus ratio of each --lesion-below."""
-    asked = []
+    lesions = []
     for text in command.lesion_below:
         site, depth, radius, ratio = numbers_of("--lesion-below", text, "SITE,DEPTH,RADIUS,RATIO")
         if site != int(site) or site < 0:
@@ -137,8 +137,8 @@ def _asked_below(command: Palpate) -> list[tuple[int, float, float, float]]:
                 f"--lesion-below {text}: the centre is {depth * 1e3:g} mm deep, the radius {radius * 1e3:g} mm; the "
                 "rule is depth > radius > 0, or it sticks out of the organ"
             )
-        asked.append((int(site), depth, radius, ratio))
-    return asked
+        lesions.append((int(site), depth, radius, ratio))
+    return lesions
 
 
 def _below_site(anatomy: Anatomy, site: int, depth: float, radius: float, ratio: float) -> tuple[Vector, float, float]:

@@ -18,7 +18,7 @@ from surgsim_apps.patient.supports import held_text
 from surgsim_apps.reports.html_page import Picture, render_page
 from surgsim_apps.reports.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
 from surgsim_env.rendering import cut_edges
-from surgsim_env.scene import hertz_force, hidden_text, share_text
+from surgsim_env.scene import hertz_force, hidden_share, share_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -166,6 +166,15 @@ def _palpation(organ: PatientScene) -> Rows:
         ("held", "not checked" if organ.hold is None else organ.hold.text),
         ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
     ]
+
+
+def hidden_text(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> str:
+    """`hidden_share` in words."""
+    share = hidden_share(force, tip_radius, press_depth, contact_stiffness)
+    return (
+        f"contact hides about {share:.1%} of the contrast over 1 where a press feels {force:.2f} N: "
+        f"9 F / (4 pi k_p R d^2) with k_p {contact_stiffness:.3g} N/m^3"
+    )
 
 
 def organ_picture(organ: PatientScene) -> bytes:

@@ -1,7 +1,7 @@
 """Blocks at finite strain: quadratic hexahedra of a hyperelastic solid, and an organ in static equilibrium.
 
 A block with faces square to the axes is pulled, compressed or sheared by its ends z = 0 and z = height. Ends are bonded
-to plates, or slide on them. The solids are those of `msdm_core.material.continuum`.
+to plates, or slide on them. The solids are those of `surgsim_apps.validation.continuum`.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,10 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import spsolve
 
 from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
-from msdm_core.material import STRAIN_LEAST, Stiffening
+from msdm_core.material import Stiffening
 from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.organ import node_strains, rest_state
+from surgsim_apps.validation.continuum import STRAIN_LEAST
 from surgsim_apps.validation.elements import Cells, Size
 from surgsim_apps.validation.statics import averaged_gradient, block_sum, node_rows, nodes_at, volume_gradient
 

@@ -12,12 +12,11 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from msdm_core.kernels import OrganModel, OrganState
-from msdm_core.material import (
-    Damping,
-    Material,
-    Relaxation,
+from msdm_core.material import Damping, Material, Relaxation, Stiffening
+from msdm_core.meshing import box_mesh
+from msdm_core.organ import OrganSpec, advance_or_raise, blank_state, compile_organ, rest_state
+from surgsim_apps.validation.continuum import (
     SpringSolid,
-    Stiffening,
     bar_gradient,
     lattice_directions,
     simple_shear_stress,
@@ -25,8 +24,6 @@ from msdm_core.material import (
     stretch_across,
     uniaxial_stress,
 )
-from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, advance_or_raise, blank_state, compile_organ, rest_state
 from surgsim_apps.validation.elements import BallContact
 from surgsim_apps.validation.hyperelastic import OrganBlock, Plates, QuadraticBlock, Test, solved
 from surgsim_apps.validation.punch import reference_layer

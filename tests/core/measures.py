@@ -7,7 +7,7 @@ from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.material.tissue_law import ARM_COUNT, Relaxation
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.measure import _node_rises, node_strains, spring_energies
+from msdm_core.organ.measure import node_rises, node_strains, spring_energies
 from msdm_core.organ.motion import RATE, SIGNAL, WORK
 
 
@@ -88,7 +88,7 @@ def _lengths_of(model: OrganModel, tension: FloatArray) -> FloatArray:
     for _ in range(LENGTH_ROUNDS):
         length = model.spring_rest_length + linear / (1.0 + rise[model.spring_nodes].mean(axis=1))
         strain = node_strains(model, length)
-        wanted = _node_rises(model, strain)
+        wanted = node_rises(model, strain)
         if (np.abs(wanted - rise) <= LENGTH_TOLERANCE * (1.0 + rise)).all():
             return length
         ramp = np.clip((strain - model.node_onset) * model.node_growth, 0.0, 1.0)

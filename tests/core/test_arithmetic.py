@@ -23,14 +23,14 @@ ARGUMENTS = {
 }
 
 
-def ulps(found, expected):
-    return float((np.abs(found - expected) / np.spacing(np.abs(expected))).max())
+def ulps(values, expected):
+    return float((np.abs(values - expected) / np.spacing(np.abs(expected))).max())
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
 def test_as_accurate_as_numpy(name):
-    found = getattr(arithmetic, name)(*ARGUMENTS[name])
-    assert ulps(found, getattr(np, name)(*ARGUMENTS[name])) <= ULPS
+    values = getattr(arithmetic, name)(*ARGUMENTS[name])
+    assert ulps(values, getattr(np, name)(*ARGUMENTS[name])) <= ULPS
 
 
 @pytest.mark.parametrize("name", ["sin", "cos"])
@@ -75,9 +75,9 @@ def test_power():
     ],
 )
 def test_ends_of_a_domain(name, arguments, expected):
-    found = getattr(arithmetic, name)(*arguments)
-    assert isinstance(found, float)
-    assert found == pytest.approx(expected, rel=1e-15, abs=0.0, nan_ok=True)
+    value = getattr(arithmetic, name)(*arguments)
+    assert isinstance(value, float)
+    assert value == pytest.approx(expected, rel=1e-15, abs=0.0, nan_ok=True)
 
 
 @pytest.mark.parametrize(
@@ -89,9 +89,9 @@ def test_ends_of_a_domain(name, arguments, expected):
 )  # fmt: skip
 def test_matmul_is_numpys(a, b):
     a, b = RNG.normal(size=a), RNG.normal(size=b)
-    found = arithmetic.matmul(a, b)
-    assert found.shape == (a @ b).shape
-    assert found == pytest.approx(a @ b, abs=1e-13)
+    product = arithmetic.matmul(a, b)
+    assert product.shape == (a @ b).shape
+    assert product == pytest.approx(a @ b, abs=1e-13)
 
 
 def test_matmul_takes_views_as_they_are():

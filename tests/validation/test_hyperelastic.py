@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from msdm_core.material.continuum import SpringSolid, lattice_directions, uniaxial_stress
 from msdm_core.material.regions import Damping, Material
 from msdm_core.material.tissue_law import Stiffening
 from msdm_core.meshing.lattice_meshing import box_mesh
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from surgsim_apps.validation.continuum import SpringSolid, lattice_directions, uniaxial_stress
 from surgsim_apps.validation.hyperelastic import OrganBlock, QuadraticBlock
 from surgsim_apps.validation.statics import linear_organ
 

@@ -29,7 +29,7 @@ def test_advance_counts_contact_in_the_stable_step_and_refuses_a_foreign_state()
     limit = stable_dt(model, law)
     assert limit < 0.6 * model.stable_step
     state = rest_state(model, shape_count=1)
-    with pytest.raises(OrganError, match="at most the stable step with contact"):
+    with pytest.raises(OrganError, match="at most the stable step"):
         advance(model, state, dt=1.001 * limit, shapes=shapes, contact=law)
     advance(model, state, dt=0.999 * limit, shapes=shapes, contact=law)
     # Without shapes nothing touches, and the longer step is fine.
@@ -89,7 +89,7 @@ def step(model: OrganModel, state: OrganState, shapes: ContactShapes, law: Conta
 
 
 def rises(force: NDArray) -> bool:
-    """Whether a force read every 10 ms rises from the first touch on (within that, the organ's own swing shows).
+    """True if a force read every 10 ms rises from the first touch on (within that, the organ's own swing shows).
 
     Over a node the nearest quadrature point is 1.2 mm to the side: a ball of 8 mm sinks 0.1 mm and more before it
     meets one.
@@ -139,13 +139,13 @@ FLOOR_LAW = ContactLaw(stiffness=2e7, damping=0.0, friction=0.3, tangential_stif
 
 @cache
 def floor() -> OrganModel:
-    """A plate whose nodes do not move and whose top may be touched: contact and friction by themselves."""
+    """A plate of fixed nodes with a free top: contact and friction by themselves."""
     free = oracle.block((0.02, 0.02, 0.002), (20, 20, 2))
     return free._replace(node_inverse_mass=oracle.frozen(np.zeros_like(free.node_mass)), stable_step=1.0)
 
 
 def on_floor(depth: float, *, radius: float = 0.008) -> tuple[OrganState, ContactShapes]:
-    """A ball that stands the given depth [m] in the floor's middle."""
+    """A ball at a depth [m] in the middle of the floor."""
     state = rest_state(floor(), shape_count=1)
     return state, oracle.ball((0.01003, 0.00996, 0.002 - depth + radius), radius)
 
@@ -201,7 +201,7 @@ def test_sticking_friction_is_a_spring_that_remembers():
 
 
 def test_sliding_on_tissue():
-    """On the phantom too, friction drags by mu N, and not at all where mu = 0: mean over one cell of the lattice.
+    """On the phantom too, friction drags by mu N, and not at all for mu = 0: mean over one cell of the lattice.
 
     Pressed 1.5 mm and drawn along x; on the way the mesh lets the force along x swing by 0.03 N / N either way.
     """

@@ -38,7 +38,7 @@ def organ(site: str, hard: bool) -> OrganModel:
 
 
 class End(NamedTuple):
-    """How a press ended: depth [m], the fault's words or "", forces upward [N], the state, the ball's centre [m]."""
+    """End of a press: depth [m], the fault's words or "", forces upward [N], the state, the ball's centre [m]."""
 
     depth: float
     fault: str
@@ -73,19 +73,19 @@ def press(
 
 
 def winding_number(point: NDArray, corners: NDArray) -> float:
-    """How often a closed surface of triangles (n, 3, 3) goes around a point: 0 outside, 1 inside.
+    """Winding number of a closed surface of triangles (n, 3, 3) around a point: 0 outside, 1 inside.
 
     Sum of solid angles / 4 pi, tan(w / 2) = a . (b x c) / (abc + (a . b) c + (b . c) a + (c . a) b) (Van Oosterom).
     """
     a, b, c = (corners - point).transpose(1, 0, 2)
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     top = np.einsum("ij,ij->i", a, np.cross(b, c))
-    ab, bc, ca = ((one * two).sum(axis=1) for one, two in ((a, b), (b, c), (c, a)))
+    ab, bc, ca = ((first * second).sum(axis=1) for first, second in ((a, b), (b, c), (c, a)))
     return float(np.arctan2(top, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2.0 * np.pi))
 
 
 def check_end(model: OrganModel, end: End, depth: float) -> None:
-    """A named fault that is true, or a press that came through whole."""
+    """A true named fault, or a complete press."""
     ratios = volume_ratios(model, end.state)
     if end.fault:
         named = re.match(r"tet (\d+) turned inside out: volume ratio", end.fault)

@@ -31,10 +31,10 @@ def run(
 ) -> NDArray:
     """Mean wrench of each millisecond, (n, n_tool, 6)."""
     count, each = round(seconds / 1e-3), round(1e-3 / dt)
-    found = np.zeros((count, len(shapes.tool_centre), 6))
+    wrench = np.zeros((count, len(shapes.tool_centre), 6))
     for number in range(count):
-        assert advance_organ(model, state, shapes, law, dt, each, found[number]) == FAULT_NONE
-    return found
+        assert advance_organ(model, state, shapes, law, dt, each, wrench[number]) == FAULT_NONE
+    return wrench
 
 
 def test_contact_is_stiffer_than_an_explicit_one_could_be():

@@ -132,8 +132,8 @@ def test_an_index_that_names_a_file_for_other_types_is_noticed(source: Path):
     """Of two processes that compile for different types at once, numba may leave it."""
     first = kernels(source)
     assert (first.double(1.5), first.double(21)) == (3.0, 42.0)
-    one, other = sorted((source.parent / "cache").rglob("*double*.nbc"))
-    shutil.copy(one, other)
+    first_file, second_file = sorted((source.parent / "cache").rglob("*double*.nbc"))
+    shutil.copy(first_file, second_file)
     later = kernels(source)
     assert later.double(1.5) == 3.0
     with pytest.warns(RuntimeWarning, match=r"a function for \(float64,\) is filed under \(int64,\)"):

@@ -50,7 +50,7 @@ def organ(hard: bool = False) -> OrganModel:
 
 
 def holds(model: OrganModel, state: OrganState, point: NDArray) -> bool:
-    """Whether a point lies in any of the deformed tets (all four of its barycentric coordinates above 0)."""
+    """True if a point lies in any of the deformed tets (all four of its barycentric coordinates above 0)."""
     corners = state.node_position[model.tet_nodes]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     flat = np.abs(np.linalg.det(edges)) < 1e-18
@@ -117,7 +117,7 @@ def test_the_guard_is_silent_in_a_palpation(site: str):
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     ends = push.shapes.shape_ends[0]
     pairs = [oracle.nearest_pair(ends, corners, normal) for corners, normal in zip(triangles, normals)]
-    nearest = min(float(np.linalg.norm(one - other)) for one, other in pairs)
+    nearest = min(float(np.linalg.norm(on_axis - on_surface)) for on_axis, on_surface in pairs)
     print(f"\n{site}: {push.force[-1]:.3f} N, surface {nearest / radius:.2f} r from the axis")
     assert nearest > 0.6 * radius
 

@@ -36,7 +36,7 @@ def hold(*given):
 
 
 def held(ratio: float, velocity: NDArray, force: NDArray) -> NDArray:
-    """What `hold_squeezed` adds to the forces on a tet of that volume ratio [N], shape (4, 3)."""
+    """Forces of `hold_squeezed` on a tet of a volume ratio [N], shape (4, 3)."""
     after = force.copy()
     inverse_volume = np.array([ratio / tet_volumes(CORNERS, TET)[0]])
     group = np.zeros(1, dtype=np.int32)

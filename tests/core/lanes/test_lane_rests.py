@@ -113,22 +113,22 @@ class Both:
         assert self.lane_wrench[: len(self.organs)].tobytes() == self.wrench.tobytes()
         for lane, single in enumerate(self.alone):
             assert same(get_lane(self.state, lane), single) == [], f"lane {lane}"
-            for one, other in zip(lane_shapes(self.shapes, lane), self.balls[lane], strict=True):
-                assert one.tobytes() == other.tobytes()
+            for together, alone in zip(lane_shapes(self.shapes, lane), self.balls[lane], strict=True):
+                assert together.tobytes() == alone.tobytes()
 
 
 def test_the_blocks_differ_in_all_that_lanes_share_otherwise():
-    one, other = drawn(0), drawn(1)
-    assert not same_rest(one, other) and same_rest(one, one._replace(tet_bulk=other.tet_bulk))
-    assert len(one.surface_triangles) < len(other.surface_triangles)
-    assert len(one.support_nodes) < len(other.support_nodes)
+    first, second = drawn(0), drawn(1)
+    assert not same_rest(first, second) and same_rest(first, first._replace(tet_bulk=second.tet_bulk))
+    assert len(first.surface_triangles) < len(second.surface_triangles)
+    assert len(first.support_nodes) < len(second.support_nodes)
     for name in ("spring_rest_length", "tet_inverse_volume", "node_inverse_volume"):
-        assert not np.array_equal(getattr(one, name), getattr(other, name)), name
+        assert not np.array_equal(getattr(first, name), getattr(second, name)), name
     with pytest.raises(OrganError, match=r"another spring_rest_length .* or stack them with own_rest"):
-        stack_organs([one, other])
+        stack_organs([first, second])
     coarse = oracle.block(SIZE, (3, 2, 2), damping=DAMPED, gravity=DOWN)
     with pytest.raises(OrganError, match=r"lane 1 has another spring_nodes .* share tets, supports"):
-        stack_organs([one, coarse], own_rest=True)
+        stack_organs([first, coarse], own_rest=True)
 
 
 def test_a_press_is_that_of_the_organ_alone():
@@ -144,11 +144,11 @@ def test_a_press_is_that_of_the_organ_alone():
 def test_foundations_and_moving_ground_are_those_of_the_organ_alone():
     """Blocks bent each its own way, held by fat at the same nodes and carried by the same motions: to the bit."""
     both = Both([held(index) for index in range(6)])
-    one, other = both.organs[:2]
-    assert np.array_equal(one.foundation_nodes, other.foundation_nodes)
-    assert len(one.motion_anchored_nodes) != len(other.motion_anchored_nodes)
+    first, second = both.organs[:2]
+    assert np.array_equal(first.foundation_nodes, second.foundation_nodes)
+    assert len(first.motion_anchored_nodes) != len(second.motion_anchored_nodes)
     for name in ("foundation_position", "foundation_stiffness", "motion_node_shift", "motion_foundation_shift"):
-        assert not np.array_equal(getattr(one, name), getattr(other, name)), name
+        assert not np.array_equal(getattr(first, name), getattr(second, name)), name
     for lane, single in enumerate(both.alone):
         steer(single, (0.5 + 0.1 * lane, -0.4), 100 * SUBSTEP * SUBSTEPS)
         put_lane(both.state, lane, single)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
+    KEPT_NAMES,
     LANE_EMPTY,
-    SCRATCH_FIELDS,
     ContactLaw,
     ContactShapes,
     LaneModel,
@@ -39,7 +39,7 @@ SUBSTEP, SUBSTEPS = 5e-5, 5
 
 def same(a: OrganState, b: OrganState) -> list[str]:
     """The fields in which two states differ in any bit (a number that is not one equals itself)."""
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in OrganState._fields if name not in SCRATCH_FIELDS}
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in KEPT_NAMES}
     return [name for name, (left, right) in pairs.items() if left.tobytes() != right.tobytes()]
 
 
@@ -174,13 +174,14 @@ def test_a_press_is_that_of_the_organ_alone(yields: bool):
 
 
 def guard_pushes(organ: OrganModel, state: OrganState, ball: ContactShapes) -> bool:
-    """Whether any triangle is within the guard's reach of a ball's centre."""
+    """True if any triangle is within the guard's reach of a ball's centre."""
     corners = state.node_position[organ.surface_triangles]
     near = np.linalg.norm(corners.mean(axis=1) - ball.tool_centre[0], axis=1) < 0.006
-    for one in corners[near]:
-        normal = np.cross(one[1] - one[0], one[2] - one[0])
+    for triangle in corners[near]:
+        normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
         radius = float(ball.shape_radius[0])
-        if oracle.guard_energy(ball.shape_ends[0], radius, one, normal / np.linalg.norm(normal), LAW.stiffness) > 0.0:
+        normal /= np.linalg.norm(normal)
+        if oracle.guard_energy(ball.shape_ends[0], radius, triangle, normal, LAW.stiffness) > 0.0:
             return True
     return False
 
@@ -287,22 +288,22 @@ def test_left_over_lanes_stand_still():
 
 def test_only_organs_that_share_a_mesh_stand_side_by_side():
     organs = pressed_organs()
-    one = organs[0]
-    mass = one.node_inverse_mass.copy()
+    base = organs[0]
+    mass = base.node_inverse_mass.copy()
     mass[np.argmax(mass)] = 0.0
     others = {
-        "alpha": one._replace(alpha=1.0),
-        "gravity": one._replace(gravity=oracle.frozen([0.0, 0.0, -9.81])),
+        "alpha": base._replace(alpha=1.0),
+        "gravity": base._replace(gravity=oracle.frozen([0.0, 0.0, -9.81])),
         "spring_nodes": oracle.block((0.03, 0.02, 0.02), (3, 2, 2), anchored_below=0.0, damping=DAMPED),
-        "anchors": one._replace(node_inverse_mass=oracle.frozen(mass)),
+        "anchors": base._replace(node_inverse_mass=oracle.frozen(mass)),
     }
     model = stack_organs(organs[:2])
     for field, other in others.items():
         with pytest.raises(OrganError, match=rf"lane 1 .*{field}"):
-            stack_organs([one, other])
+            stack_organs([base, other])
         with pytest.raises(OrganError, match=rf"lane 6 .*{field}"):
             set_lane(model, 6, other)
     with pytest.raises(OrganError, match="9"):
-        stack_organs([one] * 9)
+        stack_organs([base] * 9)
     with pytest.raises(OrganError, match="16"):
-        stack_organs([one], lanes=16)
+        stack_organs([base], lanes=16)

@@ -209,8 +209,8 @@ def test_minimum_is_the_one_that_scipy_finds():
     system, right = random.normal(size=(60, 40)), random.normal(size=60)
     expected = lsq_linear(system, right, bounds=(0.05, np.inf), method="bvls", tol=1e-14).x
     assert (expected == 0.05).any() and (expected > 0.05).any()
-    found = minimise_bounded(csr_array(system.T @ system), system.T @ right, np.ones(40), 0.05)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    solution = minimise_bounded(csr_array(system.T @ system), system.T @ right, np.ones(40), 0.05)
+    np.testing.assert_allclose(solution, expected, atol=1e-5)
 
 
 # ---- lesions ----------------------------------------------------------------------------------------------------

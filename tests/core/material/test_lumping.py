@@ -118,9 +118,9 @@ def test_table_1_as_printed_at_the_heights_that_give_it(height, smallest, larges
     [(0.6, 0.394960, -0.521118, 1.563355), (0.2, 0.120087, -0.758134, 2.274402)],
 )
 def test_table_1_exactly_at_its_aspect_ratios(ratio, height, smallest, largest):
-    found = brentq(lambda h: aspect_ratio(cap(h)) - ratio, 0.05, REGULAR_HEIGHT, xtol=1e-14)
-    assert found == pytest.approx(height, abs=1e-6)
-    change = 4 * voronoi_fractions(cap(found), ONE)[0] - 1
+    cap_height = brentq(lambda h: aspect_ratio(cap(h)) - ratio, 0.05, REGULAR_HEIGHT, xtol=1e-14)
+    assert cap_height == pytest.approx(height, abs=1e-6)
+    change = 4 * voronoi_fractions(cap(cap_height), ONE)[0] - 1
     assert change[:3] == pytest.approx([smallest] * 3, abs=1e-6)
     assert change[3] == pytest.approx(largest, abs=1e-6)
 

@@ -137,7 +137,7 @@ def bulk_modulus(spring_modulus, volume_modulus):
 def mixture(share):
     """Spring and volume modulus of HEALTHY with a share of HARD: p^(1 - f) q^f of the shear and the bulk moduli."""
     modulus = HEALTHY.spring_modulus ** (1.0 - share) * HARD.spring_modulus**share
-    soft, hard = (bulk_modulus(one.spring_modulus, one.volume_modulus) for one in (HEALTHY, HARD))
+    soft, hard = (bulk_modulus(material.spring_modulus, material.volume_modulus) for material in (HEALTHY, HARD))
     return modulus, soft ** (1.0 - share) * hard**share - (2.0 / 3.0) * modulus
 
 

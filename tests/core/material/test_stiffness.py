@@ -29,7 +29,7 @@ def spans(mesh: TetMesh, edges: NDArray) -> NDArray:
 
 
 def interior(points: NDArray, *, rim: float) -> NDArray:
-    """Which points of the lattice lie at least `rim` inside all its faces."""
+    """True for points of the lattice at least `rim` inside all its faces."""
     return ((points > rim - 1e-9) & (points < CELLS * CELL - rim + 1e-9)).all(axis=1)
 
 

@@ -1,4 +1,4 @@
-"""What carries points near a body's boundary: the nearest boundary points, and gradients at nodes."""
+"""Carriers of points near a body's boundary (nearest boundary points), and gradients at nodes."""
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ def test_nearest_boundary_points_are_those_of_all_triangles(mesh):
     rng = np.random.default_rng(0)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     points = rng.uniform(low - 0.01, high + 0.01, (200, 3))
-    found = find_carriers(points, mesh)
+    carriers = find_carriers(points, mesh)
     corners = mesh.points[mesh.boundary_triangles]
-    np.testing.assert_allclose(found.distance, NearestTriangle(corners).distances(points), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(np.einsum("pi,pij->pj", found.weights, corners[found.triangle]), found.nearest)
-    assert (found.weights >= 0.0).all()
-    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0)
+    np.testing.assert_allclose(carriers.distance, NearestTriangle(corners).distances(points), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.einsum("pi,pij->pj", carriers.weights, corners[carriers.triangle]), carriers.nearest)
+    assert (carriers.weights >= 0.0).all()
+    np.testing.assert_allclose(carriers.weights.sum(axis=1), 1.0)
 
 
 def test_a_point_is_carried_to_a_share_of_the_longest_edges_around_it():
@@ -35,14 +35,14 @@ def test_a_point_is_carried_to_a_share_of_the_longest_edges_around_it():
         for node in mesh.boundary_triangles[nearest.triangle[0]]
     ]
     gaps = REACH * float(nearest.weights[0] @ around) * np.array([0.99, 1.01])
-    found = find_carriers(above + gaps[:, None] * np.array([0.0, 0.0, 1.0]), mesh)
-    np.testing.assert_allclose(found.distance, gaps)
-    assert found.beyond.tolist() == [False, True]
+    carriers = find_carriers(above + gaps[:, None] * np.array([0.0, 0.0, 1.0]), mesh)
+    np.testing.assert_allclose(carriers.distance, gaps)
+    assert carriers.beyond.tolist() == [False, True]
 
 
 def test_gradients_of_a_linear_function_are_exact_at_every_node():
     mesh = kidney(0.008)
     slope = np.array([[1.5, -0.3, 0.2], [0.1, 0.7, -0.9], [-0.4, 0.6, 1.1]])
     nodes = mesh.boundary_nodes[::3]
-    found = (node_gradients(mesh, nodes) @ (mesh.points @ slope + 0.02)).reshape(-1, 3, 3)
-    np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), rtol=0, atol=1e-12)
+    gradients = (node_gradients(mesh, nodes) @ (mesh.points @ slope + 0.02)).reshape(-1, 3, 3)
+    np.testing.assert_allclose(gradients, np.broadcast_to(slope, gradients.shape), rtol=0, atol=1e-12)

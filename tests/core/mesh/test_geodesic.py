@@ -60,6 +60,6 @@ def test_balls_exclude_no_nearest_triangle(size):
     for query in queries + size * rng.standard_normal(queries.shape):
         weights = nearest_weights(corners, query)
         squared = ((np.einsum("ti,tij->tj", weights, corners) - query) ** 2).sum(axis=1)
-        found, found_weights = nearest(query)
-        assert found == np.argmin(squared)
-        np.testing.assert_array_equal(found_weights, weights[found])
+        triangle, weights_there = nearest(query)
+        assert triangle == np.argmin(squared)
+        np.testing.assert_array_equal(weights_there, weights[triangle])

@@ -27,13 +27,13 @@ def scattered(seed: int, count: int) -> TetMesh:
 
 
 def gaps(items: np.ndarray) -> np.ndarray:
-    """How many places before each item one of its nodes was used last."""
+    """Distance of each item from the last use of any of its nodes, in places."""
     last: dict[int, int] = {}
-    found = []
+    distances = []
     for place, nodes in enumerate(items.tolist()):
-        found.append(place - max(last.get(node, -1000) for node in nodes))
+        distances.append(place - max(last.get(node, -1000) for node in nodes))
         last.update(dict.fromkeys(nodes, place))
-    return np.array(found)
+    return np.array(distances)
 
 
 def reach(items: np.ndarray, node_count: int) -> float:

@@ -126,8 +126,8 @@ def test_regular_coplanar_tiles_do_not_count_as_crossing():
 def test_lines_cross_a_box_twice_where_its_planes_are():
     vertices, faces = box((4.4, 3.0, 7.0))
     u, v, at = line_hits(vertices[:, 0], vertices[:, 1], vertices[:, 2], faces, 0)
-    found = sorted(zip(u.tolist(), v.tolist(), np.round(at, 12).tolist(), strict=True))
-    assert found == [(i, j, z) for i in (-2, 0, 2) for j in (0,) for z in (-3.5, 3.5)]
+    crossings = sorted(zip(u.tolist(), v.tolist(), np.round(at, 12).tolist(), strict=True))
+    assert crossings == [(i, j, z) for i in (-2, 0, 2) for j in (0,) for z in (-3.5, 3.5)]
 
 
 def test_lines_through_edges_and_vertices_hit_each_side_once():

@@ -82,7 +82,7 @@ def test_other_programs_see_points_and_tags(tmp_path, random_mesh):
 
 
 def test_other_suffixes_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match="meshes are written as"):
+    with pytest.raises(ValueError, match=r"\.vtu"):
         write_mesh(tmp_path / "a.msh", TetMesh(POINTS, TETS))
 
 

@@ -172,9 +172,8 @@ def random_cuts(lattice, random):
 def test_angles_are_bounded_for_every_pattern_of_sides_and_cuts(seed):
     lattice = stuffing.Lattice(np.zeros(3), 1.0, (53, 53, 53))
     sign, cuts = random_cuts(lattice, np.random.default_rng(seed))
-    cuts, warped_to = stuffing._warp(cuts, sign, lattice)
-    tets = stuffing._stencils(stuffing._background_tets(lattice, sign), sign, cuts, lattice)
-    points, tets = stuffing._compressed(tets, warped_to, cuts, lattice)
+    limit = np.where(cuts.is_long, 0.24999, 0.41189)
+    points, tets = stuffing.fill_background(stuffing._background_tets(lattice, sign), cuts, limit, sign, lattice)
     faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
     keys = (faces[:, 0] * len(points) + faces[:, 1]) * len(points) + faces[:, 2]
     assert np.unique(keys, return_counts=True)[1].max() == 2

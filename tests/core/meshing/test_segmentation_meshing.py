@@ -106,7 +106,7 @@ def test_only_named_labels_are_filled():
     half = labels.copy()
     half[half.shape[0] // 2 :][half[half.shape[0] // 2 :] > 0] = 9
     whole, part = (
-        mesh_segmentation(one, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"}) for one in (labels, half)
+        mesh_segmentation(image, (0.002,) * 3, cell_size=0.008, region_names={1: "liver"}) for image in (labels, half)
     )
     assert part.volumes.sum() == pytest.approx(0.5 * whole.volumes.sum(), rel=0.15)
 

@@ -183,7 +183,7 @@ def test_energy_stays_without_drift():
 
 
 def column_shortening(cells_across: int) -> float:
-    """How far the top of a bonded 15 x 15 x 60 mm column sinks under its weight, over rho g L^2 / (2 E)."""
+    """Settlement of a bonded 15 x 15 x 60 mm column under its weight, over rho g L^2 / (2 E)."""
     length, modulus, density = 0.06, 1e5, 1000.0
     model = oracle.block(
         (0.015, 0.015, length),
@@ -241,8 +241,8 @@ def test_a_run_repeats_to_the_bit():
     pressed_run(oracle.block(anchored_below=1e-4, material=Material(9000.0, 900.0, 0.3)))
     second = pressed_run(oracle.block(anchored_below=1e-4, damping=Damping(alpha=20.0, beta=1e-4)))
     assert first.contact_engaged.any() and np.abs(first.contact_stretch).max() > 0.0
-    for name, one, other in zip(first._fields, first, second):
-        assert one.tobytes() == other.tobytes(), name
+    for name, before, after in zip(first._fields, first, second):
+        assert before.tobytes() == after.tobytes(), name
 
 
 def test_an_inverted_tet_is_named():

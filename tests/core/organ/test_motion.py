@@ -50,7 +50,7 @@ def follow(model: OrganModel, state: OrganState, signals, step: float, count: in
 
 
 def static_shift(motion: Motion) -> np.ndarray:
-    """Where the marker comes to rest at signal 1, from where it is at signal 0 [m] (3,)."""
+    """Displacement of the resting marker from signal 0 to signal 1 [m] (3,)."""
     model = compile_organ(replace(HELD, motions=(motion,), damping=Damping(alpha=60.0)))
     state = rest_state(model)
     rise = [cycle(0.5 * share, 1.0) for share in np.linspace(0.0, 1.0, 300)]

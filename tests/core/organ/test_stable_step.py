@@ -1,4 +1,4 @@
-"""What the stable step counts, by running below and beyond it: springs, volume term, damping, contact, friction."""
+"""Parts of the stable step, by runs below and beyond it: springs, volume term, damping, contact, friction."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ PARTS = {
 
 
 def growth(model: OrganModel, contact: ContactLaw | None, dt: float) -> float:
-    """How far two runs part that differ by 1e-11 m in every node at the start, over that, in up to 2000 steps.
+    """Growth of a difference of 1e-11 m in every node between two runs, in up to 2000 steps.
 
     Under the plate both start settled: a node that is not knocked off it (1e-6 m deep) stays in contact.
     """
@@ -57,7 +57,7 @@ def growth(model: OrganModel, contact: ContactLaw | None, dt: float) -> float:
     twin.node_position[free] += np.random.default_rng(0).uniform(-KNOCK, KNOCK, (int(free.sum()), 3))
     largest = 0.0
     for _ in range(200):
-        faults = [advance_organ(model, one, shapes, law, dt, 10, wrench) for one in (state, twin)]
+        faults = [advance_organ(model, run, shapes, law, dt, 10, wrench) for run in (state, twin)]
         apart = float(np.abs(state.node_position - twin.node_position).max())
         if any(faults) or not apart < 1e4 * KNOCK:
             return 1e4

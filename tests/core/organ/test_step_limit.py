@@ -135,10 +135,10 @@ def test_contact_hold_is_that_of_the_node_held_most():
 
 def swept(gram: NDArray, hold: NDArray) -> NDArray:
     """The X of p = X v that the sweeps reach from p = 0: each adds w (v - (1 + G) p) / (1 + h)."""
-    found = np.zeros_like(gram)
+    x = np.zeros_like(gram)
     for factor in SWEEPS:
-        found += factor / (1.0 + hold[:, None]) * (np.eye(len(gram)) - found - gram @ found)
-    return found
+        x += factor / (1.0 + hold[:, None]) * (np.eye(len(gram)) - x - gram @ x)
+    return x
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0, 6.9])
@@ -161,10 +161,10 @@ def test_what_the_sweeps_leave_is_bounded_for_any_points(scale: float):
         size = scale / float((held / mass).max())
         hold = size * (norm / total[:, None]) @ (held / mass)
         gram = size * (slope / mass) @ slope.T
-        found = swept(gram, hold)
-        np.testing.assert_allclose(found, found.T, atol=1e-12)
-        assert np.linalg.eigvalsh(found - np.linalg.inv(2.0 * np.eye(points) + gram)).min() > -1e-9
-        root = np.real(np.linalg.cholesky(found + 1e-15 * np.eye(points)))
+        x = swept(gram, hold)
+        np.testing.assert_allclose(x, x.T, atol=1e-12)
+        assert np.linalg.eigvalsh(x - np.linalg.inv(2.0 * np.eye(points) + gram)).min() > -1e-9
+        root = np.real(np.linalg.cholesky(x + 1e-15 * np.eye(points)))
         assert np.linalg.eigvalsh(root.T @ gram @ root).max() < 1.0 + 1e-9
 
 

@@ -55,7 +55,7 @@ def outline(support: Support, random: np.random.Generator, count: int = 20000) -
 
 
 def inside(support: Support, point: np.ndarray) -> bool:
-    """Whether a point of a solid's own frame lies in it."""
+    """True if a point lies in a solid, in its own frame."""
     if support.kind == "plane":
         return bool(point[2] < 0.0)
     if support.kind == "box":

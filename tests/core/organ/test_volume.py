@@ -1,4 +1,4 @@
-"""Which share of the volume term is averaged at nodes, and that averaging neither adds nor loses any of it."""
+"""Averaged share of the volume term, and its conservation by averaging."""
 
 import numpy as np
 import pytest

@@ -1,10 +1,10 @@
-"""The continuum of stiffening springs at finite strain, alone in a bar and in simple shear.
+"""Continuum of stiffening springs at finite strain, in a bar and in simple shear.
 
-Springs in all directions that deform with the continuum are the affine micro-sphere model (Miehe, Göktepe and Lulei
-2004, doi 10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch l =
-|F N|. With linear springs it has Lame's lambda = mu = c / 15 at small strain. Here that mean, not each spring, is
-what stiffens (`Stiffening`). The springs of a BCC lattice have seven directions: the quadrature of degree 5 of the
-mean. Each node is a centre of symmetry, so that a homogeneous deformation of the lattice is affine whatever the law.
+Springs of all directions in affine deformation are the affine micro-sphere model (Miehe, Göktepe and Lulei 2004, doi
+10.1016/j.jmps.2004.03.011): W = c <psi(l)>, the mean over directions N of the energy psi at the stretch l = |F N|.
+Linear springs give Lame's lambda = mu = c / 15 at small strain. Here the mean stiffens, not each spring (`Stiffening`).
+The springs of a BCC lattice have seven directions: the quadrature of degree 5 of the mean. Each node is a centre of
+symmetry, so that a homogeneous deformation of the lattice is affine for any law.
 """
 
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from msdm_core.material.tissue_law import Stiffening
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.material import Stiffening
+from msdm_core.mesh import FloatArray
 
-# The least strain that is divided by.
+# Lower bound of strain in quotients.
 STRAIN_LEAST = 1e-12
 # Directions of a quadrature over the sphere: exact to degree 2 DIRECTION_ORDER - 1.
 DIRECTION_ORDER = 12
@@ -39,7 +39,7 @@ def sphere_directions(order: int = DIRECTION_ORDER) -> tuple[FloatArray, FloatAr
 
 @lru_cache(maxsize=1)
 def lattice_directions() -> tuple[FloatArray, FloatArray]:
-    """The directions of the springs of a BCC lattice, and their shares of its stiffness by formula (6)."""
+    """Directions of the springs of a BCC lattice, and their shares of its stiffness by formula (6)."""
     diagonals = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]]) / np.sqrt(3.0)
     return np.vstack([np.eye(3), diagonals]), np.array([2.0 / 15.0] * 3 + [3.0 / 20.0] * 4)
 
@@ -53,7 +53,7 @@ def determinant_and_cofactor(gradient: FloatArray) -> tuple[FloatArray, FloatArr
 
 @dataclass(frozen=True, eq=False)
 class SpringSolid:
-    """Affine springs that stiffen together, and a volume term: W = 3 mu w(s) + (K_t / 2) (J - 1)^2.
+    """Affine springs with a common stiffening, and a volume term: W = 3 mu w(s) + (K_t / 2) (J - 1)^2.
 
     s^2 = 5 <(|F N| - 1)^2> is the equivalent strain of `Stiffening`, and w' its tension; linear springs have
     3 mu s^2 / 2.
@@ -79,7 +79,7 @@ class SpringSolid:
         return spans, stretch, np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
 
     def _rise(self, stretch: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Equivalent strain s, and what stiffening adds to tension and to tangent over those of linear springs."""
+        """Equivalent strain s, and the relative rise of tension and of tangent over linear springs."""
         strain = np.sqrt(5.0 * np.einsum("a,...a->...", self.directions[1], (stretch - 1.0) ** 2))
         if self.stiffening is None:
             return strain, np.zeros_like(strain), np.zeros_like(strain)
@@ -101,16 +101,16 @@ class SpringSolid:
         spans, stretch, linear = self._springs(gradient)
         share = 15.0 * self.shear_modulus * weights
         dyads = np.einsum("...ai,aj->...aij", spans, directions).reshape(*stretch.shape, 9)
-        found = np.einsum("...a,...ax,...ay->...xy", share / stretch**3, dyads, dyads, optimize=True)
-        found = found.reshape(*gradient.shape[:-2], 3, 3, 3, 3)
+        tangent = np.einsum("...a,...ax,...ay->...xy", share / stretch**3, dyads, dyads, optimize=True)
+        tangent = tangent.reshape(*gradient.shape[:-2], 3, 3, 3, 3)
         across = np.einsum("...a,aj,al->...jl", share * (1.0 - 1.0 / stretch), directions, directions, optimize=True)
-        found += np.einsum("ik,...jl->...ijkl", np.eye(3), across)
-        strain, rise, steeper = self._rise(stretch)
-        found *= (1.0 + rise)[..., None, None, None, None]
+        tangent += np.einsum("ik,...jl->...ijkl", np.eye(3), across)
+        strain, rise, tangent_rise = self._rise(stretch)
+        tangent *= (1.0 + rise)[..., None, None, None, None]
         # dw/dF is the stress of linear springs over 3 mu s.
-        more = (steeper - rise) / (3.0 * self.shear_modulus * np.maximum(strain, STRAIN_LEAST) ** 2)
-        found += more[..., None, None, None, None] * np.einsum("...ij,...kl->...ijkl", linear, linear)
-        return found + volume_tangent(gradient, self.volume_modulus)
+        slope = (tangent_rise - rise) / (3.0 * self.shear_modulus * np.maximum(strain, STRAIN_LEAST) ** 2)
+        tangent += slope[..., None, None, None, None] * np.einsum("...ij,...kl->...ijkl", linear, linear)
+        return tangent + volume_tangent(gradient, self.volume_modulus)
 
 
 def volume_tangent(gradient: FloatArray, modulus: float) -> FloatArray:
@@ -130,7 +130,7 @@ _PERMUTATION[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
 
 
 def uniaxial_stress(solid: SpringSolid, stretch: FloatArray) -> FloatArray:
-    """Force over the area at rest [Pa] of a bar with free sides at some stretches, both (n,).
+    """Force over the area at rest [Pa] of a bar with free sides at stretches along it, both (n,).
 
     Raises:
         ValueError: as `stretch_across`.
@@ -140,23 +140,23 @@ def uniaxial_stress(solid: SpringSolid, stretch: FloatArray) -> FloatArray:
 
 
 def stretch_across(solid: SpringSolid, stretch: FloatArray) -> FloatArray:
-    """Stretch across a bar with free sides at some stretches along it, both (n,), by Newton's method.
+    """Stretch across a bar with free sides at stretches along it, both (n,), by Newton's method.
 
     Raises:
-        ValueError: no stretch without stress across was found; names the stretch along the bar.
+        ValueError: no convergence; names the stretch along the bar.
     """
     stretch = np.asarray(stretch, dtype=np.float64)
     across, change, step = stretch**-0.45, np.zeros_like(stretch), 1e-6
     for _ in range(60):
         stress = solid.first_piola(bar_gradient(stretch, across))[..., 1, 1]
         slope = (solid.first_piola(bar_gradient(stretch, across + step))[..., 1, 1] - stress) / step
-        # Half of the way to nothing at most, so that no bar turns inside out.
+        # At most halved, so that no bar turns inside out.
         change = np.clip(-stress / slope, -0.5 * across, 0.5 * across)
         across = across + change
         if np.abs(change).max(initial=0.0) < 1e-12:
             return across
     worst = stretch[int(np.argmax(np.abs(change)))]
-    raise ValueError(f"the bar finds no equilibrium at the stretch {worst:g}: use smaller strains, or other parameters")
+    raise ValueError(f"no equilibrium of the bar at the stretch {worst:g}: use smaller strains, or other parameters")
 
 
 def bar_gradient(along: FloatArray, across: FloatArray) -> FloatArray:
@@ -167,7 +167,7 @@ def bar_gradient(along: FloatArray, across: FloatArray) -> FloatArray:
 
 
 def simple_shear_stress(solid: SpringSolid, amount: FloatArray) -> FloatArray:
-    """Shear stress P_12 [Pa] in simple shear x = X + g Y of some amounts g, both (n,)."""
+    """Shear stress P_12 [Pa] in simple shear x = X + g Y of amounts g, both (n,)."""
     amount = np.asarray(amount, dtype=np.float64)
     gradient = np.broadcast_to(np.eye(3), (*amount.shape, 3, 3)).copy()
     gradient[..., 0, 1] = amount

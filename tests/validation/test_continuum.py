@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from msdm_core.material.continuum import (
+from surgsim_apps.validation.continuum import (
     SpringSolid,
     determinant_and_cofactor,
     lattice_directions,

@@ -1,4 +1,4 @@
-"""A surrogate of SurgSim/PalpateSites-v0 that looks contrasts up: its faces are drawn, or recorded from organs.
+"""A surrogate of SurgSim/PalpateSites-v0 with tabulated contrasts of faces, drawn or recorded from organs.
 
 Touch map, estimator, score and rewards of finding are the environment's; there are no forces.
 """
@@ -19,7 +19,7 @@ from surgsim_env.tasks import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateS
 
 @dataclass(frozen=True, eq=False)
 class SurrogateFace:
-    """The palpable face of one episode, and what a press at each of its sites feels.
+    """The palpable face of one episode, with the contrast at each of its sites.
 
     Fields:
         map: its sites, lengths in tip radii
@@ -71,7 +71,7 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self.memory.copy(), {"error_mm": 1000.0 * self.error}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Press at the site of the map that is nearest to a place of the chart and may be pressed."""
+        """Press at the pressable site of the map nearest to a place of the chart."""
         face = self.face
         asked = 0.5 * (np.asarray(action, dtype=np.float64) + 1.0) * face.map.extent
         squared = ((face.map.sites - asked) ** 2).sum(axis=1)
@@ -91,7 +91,7 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self.memory.copy(), reward, over, False, {"error_mm": 1000.0 * self.error, "success": success}
 
     def _judged(self) -> tuple[float, float]:
-        """Error of the estimate (OSPA) [m], and the share of lesions with an estimate near them."""
+        """Error of the estimate (OSPA) [m], and the share of lesions near an estimate."""
         face = self.face
         places = face.map.sites[self.sites] * face.tip_radius
         points = face.surface(face.estimator.estimate(places, np.array(self.values)).points)

@@ -75,7 +75,8 @@ def show(name: str, draw: int, result: PalpationResult, console: Console) -> int
         unexplained += len(contrast.scores) - contrast.felt_count - len(reasons)
         console.print(
             f"{name}, draw {draw}, {contrast.name}: {contrast.felt_count} of {len(contrast.scores)}, "
-            f"{contrast.false_alarms} false alarms, {result.wall_time:.0f} s" + "".join(f"\n    {text}" for text in reasons),
+            f"{contrast.false_alarms} false alarms, {result.wall_time:.0f} s"
+            + "".join(f"\n    {text}" for text in reasons),
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     return unexplained

@@ -160,7 +160,7 @@ def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tup
     root = np.sqrt(np.maximum(b * b - a * c, 0.0))
     safe = np.where(a > 0.0, a, 1.0)
     enter = np.where(a > 0.0, (-b - root) / safe, np.where(c < 0.0, -1.0, 2.0))
-    leave = np.where(a > 0.0, (-b + root) / safe, np.where(c < 0.0, 2.0, 2.0))
+    leave = np.where(a > 0.0, (-b + root) / safe, 2.0)
     missed = (b * b - a * c <= 0.0) & (a > 0.0)
     before = np.where(missed, 1.0, np.clip(enter, 0.0, 1.0))
     after = np.where(missed, 1.0, np.clip(leave, 0.0, 1.0))

@@ -360,7 +360,8 @@ class _Finder:
                 continue
             clouds = [survey.geom_points(geom) for geom in survey.body_geoms(body)]
             # Small parts are markers and jaws; a thin part on what carries the shaft, or beyond, is the shaft.
-            clouds = [c for c in clouds if len(c) and not _is_small(c) and not (beyond and is_shaft(fit_capsule(c)))]
+            clouds = [cloud for cloud in clouds if len(cloud) and float(np.ptp(cloud, axis=0).max()) > SMALL_PART]
+            clouds = [cloud for cloud in clouds if not (beyond and is_shaft(fit_capsule(cloud)))]
             if not clouds:
                 continue
             fitted = fit_capsule(np.concatenate(clouds))
@@ -628,9 +629,6 @@ def _added(name: str, body: str, capsule: Capsule) -> AddedShape:
     start, end = vector(capsule.start, 6), vector(capsule.end, 6)
     return AddedShape(name, body, start, round(capsule.radius, 6), None if start == end else end)
 
-
-def _is_small(points: FloatArray) -> bool:
-    return float(np.ptp(points, axis=0).max()) <= SMALL_PART
 
 
 def _figures(values: FloatArray) -> tuple[float, ...]:

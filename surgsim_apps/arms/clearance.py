@@ -103,10 +103,10 @@ class ClusteredSurface:
         chunk = max(1, PAIRS_AT_ONCE // len(self._cluster_radius))
         for low in range(0, len(near), chunk):
             rows = near[low : low + chunk]
-            result[rows] = self._some(segments[rows], cap)
+            result[rows] = self._near(segments[rows], cap)
         return result
 
-    def _some(self, segments: FloatArray, cap: float) -> FloatArray:
+    def _near(self, segments: FloatArray, cap: float) -> FloatArray:
         to_centre = point_segment_distance(self._cluster_centre[None], segments[:, None])
         # Every ball contains points of the surface: the nearest is no further away than a ball's far side.
         most = np.minimum((to_centre + self._cluster_radius).min(axis=1), cap)

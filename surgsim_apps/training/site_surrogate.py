@@ -67,7 +67,7 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.memory[SLICES["excess_least"]] = face.estimator.excess_least
         self.memory[SLICES["lesion_radius"]] = face.estimator.lesion_radius / face.tip_radius
         self.memory[SLICES["presses_left"]] = 1.0
-        self.error, self.found = self._judged()
+        self.error, self.found_share = self._judged()
         return self.memory.copy(), {"error_mm": 1000.0 * self.error}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -81,11 +81,11 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.values.append(value)
         self.memory[SLICES["contrast_map"]][site], self.memory[SLICES["pressed_map"]][site] = value, 1.0
         self.memory[SLICES["presses_left"]] = 1.0 - len(self.sites) / self.budget
-        found_before = self.found
-        self.error, self.found = self._judged()
+        share_before = self.found_share
+        self.error, self.found_share = self._judged()
         weights = reward_weights(PalpateSitesTask)
         reward = weights["error"] * self.error / self.cutoff / self.budget
-        reward += weights["found"] * (self.found - found_before)
+        reward += weights["found"] * (self.found_share - share_before)
         over = len(self.sites) >= self.budget
         success = over and self.error <= SUCCESS_ERROR * face.tip_radius / REFERENCE_TIP
         return self.memory.copy(), reward, over, False, {"error_mm": 1000.0 * self.error, "success": success}

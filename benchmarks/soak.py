@@ -1,17 +1,17 @@
-"""Play environments for as long as wanted with random, corner and adversarial actions, and watch what must not happen.
+"""Long runs of environments with random, corner and adversarial actions, and checks in every step.
 
     python benchmarks/soak.py --minutes 60
-    python benchmarks/soak.py --minutes 1 --quick    small organs, alone and in float64: kernels that tests compile too
+    python benchmarks/soak.py --minutes 1 --quick    small organs, alone and in float64: kernels of the tests
     python benchmarks/soak.py --replay 0:17          repeats run 17 of seed 0, to the bit (--quick if it was)
 
 A run makes an environment of one of CASES, alone or several side by side, plays some seconds of it and goes on to the
-next; runs are drawn from a seed and their number. Watched in every control step: observations lie in their space,
+next; runs are drawn from a seed and their number. Checked in every control step: observations lie in their space,
 rewards are finite, each end has a name (a fault of FAULTS, a limit, a success, the time), and no tet is turned inside
-out unless the fault says so, by volumes that are computed here from the nodes' positions. At the end of a run a reset
-with the first seed must give the first saved state to the bit. Memory is what a process holds between runs, without
-what malloc keeps of freed memory (`memory_held`).
+out without that fault, by volumes from the nodes' positions. At the end of a run a reset with the first seed must give
+the first saved state to the bit. Memory is that held by a process between runs, without malloc's reserve of freed
+memory (`memory_held`).
 
-One process for each core (`--processes`); one that dies is a finding. Prints a table and exits 1 with findings.
+One process for each core (`--processes`); its death is a finding. Prints a table and exits 1 with findings.
 """
 
 import argparse
@@ -42,7 +42,7 @@ from surgsim_apps.bench.report import describe, load
 from surgsim_env.coupling import core_count
 from surgsim_env.scene import LEVELS
 
-# What each id is played with.
+# Arguments of each id.
 CASES: dict[str, dict[str, tuple[Any, ...]]] = {
     "SurgSim/Palpate-v0": {
         "scene": ("phantom_small", "phantom", "phantom_wide", "liver"),
@@ -58,11 +58,11 @@ WIDTHS: tuple[tuple[int, str], ...] = (
     *((1, "alone"), (8, "float64"), (5, "float64")),
     *((8, "float32"), (16, "float32")),
 )
-# Of a quick soak: the scene of palpation, and how many of WIDTHS.
+# Of a quick soak: the scene of palpation, and the number of WIDTHS.
 QUICK_SCENE, QUICK_WIDTHS = "phantom_small", 3
-# Control steps of a run; a step of PalpateSites is a press, which takes as long as many.
+# Control steps of a run; presses of PalpateSites, each as long as many control steps.
 STEPS, PRESSES = 80, 4
-# A fault's name, and the words of `sim_fault` that it goes with.
+# Names of faults, and their words in `sim_fault`.
 FAULTS = {
     "tet inverted": "turned inside out",
     "contact lost": "contact lost",
@@ -72,11 +72,11 @@ FAULTS = {
     "MuJoCo warning": "MuJoCo warning",
     "out of bounds": "left its bounds",
 }
-# Entries of `info` that name an end which is no fault.
+# Entries of `info` for ends without a fault.
 ENDS = ("success", "hard_limit", "torn", "collided", "declared")
-# Runs until the kinds of environments of a seed repeat: by then all that is kept by scene or kernel is there.
+# Runs until the kinds of environments of a seed repeat: by then everything cached by scene or kernel is there.
 KINDS = 30
-# How much more memory a process may hold from then on [bytes].
+# Largest growth of a process' memory from then on [bytes].
 GROWTH_MOST = 20e6
 
 
@@ -86,7 +86,7 @@ Action = NDArray[np.float32]
 
 
 def random_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
-    """Each entry anew in every step; ignores what is sent to it."""
+    """Each entry anew in every step; sent values are ignored."""
     while True:
         yield rng.uniform(-1.0, 1.0, size).astype(np.float32)
 
@@ -100,7 +100,7 @@ def corner_actions(rng: np.random.Generator, size: int) -> Generator[Action, flo
 
 
 def adversarial_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
-    """Corners that raise the force: one that did is kept, of one that did not an entry is turned round.
+    """Corners in search of force: after a step without a rise of the force an entry changes its sign.
 
     It is sent the largest contact force of each step [N].
     """
@@ -124,7 +124,7 @@ ACTORS: dict[str, Callable[[np.random.Generator, int], Generator[Action, float, 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: what is made, and how it is played."""
+    """One run: an environment, and the kind of its actions."""
 
     seed: int
     number: int
@@ -150,7 +150,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """How the run is given to --replay."""
+        """The run's name for --replay."""
         return f"{self.seed}:{self.number}"
 
     def __str__(self) -> str:
@@ -158,7 +158,7 @@ class Run:
         return f"run {self.name}, {self.env_id}({chosen}), {self.width} x {self.dtype}, {self.actor} actions"
 
     def make(self) -> gym.vector.VectorEnv:
-        """The environments, which are reset one by one."""
+        """The environments, without automatic resets."""
         if self.dtype == "alone":
             mode = gym.vector.AutoresetMode.DISABLED
             return gym.make_vec(self.env_id, 1, "sync", vector_kwargs={"autoreset_mode": mode}, **self.settings)
@@ -168,7 +168,7 @@ class Run:
 
 @dataclass
 class Outcome:
-    """What a run counted; `findings` are what must not happen, a sentence each; `memory` held after it [bytes]."""
+    """Counts of a run; `findings`, a sentence each; `memory` held after it [bytes]."""
 
     substeps: int = 0
     steps: int = 0
@@ -196,7 +196,7 @@ class Watch:
         self.elapsed = np.zeros(len(self.singles))
 
     def play(self) -> None:
-        """All steps of the run; an episode that ends is followed by one of another seed."""
+        """All steps of the run; an episode is followed by one of another seed."""
         rng = np.random.default_rng((self.run.seed, self.run.number, 1))
         first = self.seeds(rng)
         begun = self.reset(first)
@@ -230,8 +230,8 @@ class Watch:
         self.envs.reset(seed=seeds)
         return [env.save_state() for env in self.singles]
 
-    def find(self, what: str) -> None:
-        self.outcome.findings.append(f"{self.run}: {what}")
+    def find(self, text: str) -> None:
+        self.outcome.findings.append(f"{self.run}: {text}")
 
     def check(self, observations: NDArray[Any], rewards: NDArray[Any]) -> None:
         """Observations lie in their space, rewards are finite."""
@@ -288,17 +288,17 @@ def volume_ratios(simulation: Any) -> NDArray[np.float64]:
 
 
 def memory_resident() -> float:
-    """Resident memory of this process [bytes]; 0 where the system does not say."""
+    """Resident memory of this process [bytes]; 0 if unknown to the system."""
     status = Path("/proc/self/statm")
     return float(int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")) if status.exists() else 0.0
 
 
 def memory_held() -> float:
-    """Memory that this process holds [bytes]: resident after glibc's malloc has returned free pages to the system.
+    """Memory held by this process [bytes]: resident after glibc's malloc has returned free pages to the system.
 
     malloc keeps freed memory for later calls: 30 to 150 MB after a run, another amount after each kind of environments,
     so that resident memory drifts by tens of MB while nothing is held for longer. Without glibc it is resident memory;
-    0 where the system does not say.
+    0 if unknown to the system.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
@@ -310,11 +310,11 @@ def memory_held() -> float:
 def growth(memory: dict[int, float], processes: int) -> float | None:
     """Median gain of memory [bytes] between the first and the last run of a kind in one process; None for few pairs.
 
-    Runs of one kind are compared because kinds hold different amounts; the first of each makes what is kept.
+    Runs of one kind are compared because kinds hold different amounts; the first of each fills the caches.
 
     Args:
         memory: held after each run [bytes], by the run's number.
-        processes: number of processes, which take runs in turn.
+        processes: number of processes; they take runs in turn.
     """
     held = defaultdict(list)
     for number in sorted(memory):
@@ -331,14 +331,14 @@ def work(run: Run) -> Outcome:
     """Play a run in a process of the soak."""
     try:
         outcome = play(run)
-    except Exception:  # whatever it is, it is a finding, and the next run goes on
+    except Exception:  # any is a finding, and the next run goes on
         outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
     outcome.memory = memory_held()
     return outcome
 
 
 def make_process() -> ProcessPoolExecutor:
-    """A process of its own for runs one after the other."""
+    """A process for runs one after the other."""
     return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
 
 
@@ -422,8 +422,8 @@ def main() -> int:
         console.print(str(run), markup=False, highlight=False, soft_wrap=True)
         outcome = play(run)
         show({run.env_id: outcome}, console)
-        for one in outcome.findings:
-            console.print(one, markup=False, highlight=False, soft_wrap=True)
+        for finding in outcome.findings:
+            console.print(finding, markup=False, highlight=False, soft_wrap=True)
         return 1 if outcome.findings else 0
     deadline = time.time() + 60.0 * options.minutes
     return play_all(options.seed, options.processes, deadline, options.quick, console)

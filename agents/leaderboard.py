@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
+from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
-from surgsim_env.palpation import ScoreEstimate
 
 LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
 

@@ -93,9 +93,9 @@ class Player:
         self.expert = TolerantExpert(grasp_along=GRASP_ALONG) if pictures else RetractExpert()
         parts = [self.singles[0].observation_slices[name] for name in TAUGHT]
         self.taught = np.concatenate([np.arange(part.start, part.stop) for part in parts])
-        self.turning = self.singles[0].task.action_slices["turning"]
+        self.turning = self.singles[0].layout.action_slices["turning"]
         # All readings but the grip's grow with the pull.
-        self.pulled = np.array([entry != SLICES["grip_force"].start for entry in self.singles[0].task.force_entries])
+        self.pulled = np.array([entry != SLICES["grip_force"].start for entry in self.singles[0].layout.force_entries])
         self.seen, _ = envs.reset(seed=FIRST_SEED + 10_000 * seed)
 
     def play(self, network: PolicyNetwork, samples: Samples, steps: int, expert_share: float) -> list[bool]:

@@ -36,6 +36,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from surgsim_apps.scoring.figures import ERROR_LINE
 from surgsim_apps.training.acquisition import Acquisition
 from surgsim_apps.training.policy_files import (
     PolicyDescription,
@@ -46,7 +47,7 @@ from surgsim_apps.training.policy_files import (
 from surgsim_apps.training.recorded_faces import load_faces
 from surgsim_apps.training.site_agent import GrowingBelief, SiteProcess, observed_facts
 from surgsim_apps.training.site_surrogate import SiteSurrogate, SurrogateFace
-from surgsim_env.palpation import CUTOFF, ERROR_LINE, MAP_SIDE
+from surgsim_env.palpation import CUTOFF, MAP_SIDE
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
 # From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.

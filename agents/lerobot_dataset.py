@@ -96,10 +96,10 @@ def features(env: gym.Env, cameras: Iterable[str] = ()) -> dict[str, dict[str, A
         )
     channels = {channel.name: channel for channel in task.channels}
     commands = {command.name: command for command in task.commands}
-    origin, scale = task.scales(instrument)
+    origin, scale = inner.layout.scales(instrument)
     arms = SIDES if isinstance(instrument, Pair) else ("",)
-    state = _numbered(task.observation_slices)
-    action = _numbered(task.action_slices)
+    state = _numbered(inner.layout.observation_slices)
+    action = _numbered(inner.layout.action_slices)
     wrench = [f"{side}_{name}" if side else name for side in arms for name in WRENCH_NAMES]
     described = {
         "action": {
@@ -108,13 +108,13 @@ def features(env: gym.Env, cameras: Iterable[str] = ()) -> dict[str, dict[str, A
             "full_command": [commands[name].scale for name in action.values()],
             "full_command_units": [commands[name].unit for name in action.values()],
             "frame": WORLD if getattr(task, "frame", None) is None else "the axes of the palpable face",
-            "meaning": _meanings(commands, task.action_slices),
+            "meaning": _meanings(commands, inner.layout.action_slices),
         },
         STATE: {
             **_numbers(list(state)),
             "units": [channels[name].unit for name in state.values()],
             "frame": f"{WORLD}; where a meaning says so, the axes of the palpable face",
-            "meaning": _meanings(channels, task.observation_slices),
+            "meaning": _meanings(channels, inner.layout.observation_slices),
             "observed_as": "(value - origin) / scale is what the environment observes with scaled=True",
             "origin": origin.tolist(),
             "scale": scale.tolist(),

@@ -37,7 +37,7 @@ from tqdm import tqdm
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_apps.scoring.episodes import EpisodeActor, agent_generator
 from surgsim_apps.scoring.evaluate import strangers_actor
-from surgsim_env.palpation import EVALUATION_SEEDS
+from surgsim_apps.scoring.figures import EVALUATION_SEEDS
 from surgsim_env.rendering import CAMERAS, NoGLError
 from surgsim_env.scene import PHYSICS_VERSION
 from surgsim_env.scripting import ScriptError, oracle_script, run_script, stacked_observations

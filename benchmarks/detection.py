@@ -20,9 +20,15 @@ from rich.table import Table
 
 from msdm_core.material import Lesion
 from msdm_core.mesh import FloatArray
-from surgsim_apps.palpate.job import MODEL_MODULUS_ERROR, PalpationResult, plan_sites, run_palpation
-from surgsim_apps.palpate.scene_options import load_stable_anatomy
+from surgsim_apps.palpate.palpation import (
+    MODEL_MODULUS_ERROR,
+    PalpationResult,
+    load_stable_anatomy,
+    run_palpation,
+)
+from surgsim_apps.palpate.sites import plan_sites
 from surgsim_env.scene import Anatomy, load_anatomy, load_scene
+from surgsim_env.step_progress import StepProgress
 
 RATIO = 8.0
 RADIUS_SHARE, RADIUS_RANGE = 0.173, (0.010, 0.019)
@@ -64,7 +70,8 @@ def palpate(scene_file: Path, draw: int, count: int, console: Console) -> Palpat
     scene = load_scene(scene_file)
     lesions = draw_lesions(load_anatomy(scene), count, np.random.default_rng((draw, 1)))
     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-    return run_palpation(anatomy, lesions=lesions, seed=draw, console=console)
+    with StepProgress(console) as progress:
+        return run_palpation(anatomy, lesions=lesions, seed=draw, progress=progress)
 
 
 def show(name: str, draw: int, result: PalpationResult, console: Console) -> int:

@@ -5,10 +5,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 from PIL import Image
-from rich.console import Console
 
 from surgsim_apps.palpate.figures import write_organ_picture
-from surgsim_apps.palpate.job import run_palpation
+from surgsim_apps.palpate.palpation import run_palpation
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.coupling import Simulation
 from surgsim_env.envs import SurgicalEnv
@@ -77,7 +76,7 @@ def main() -> None:
         write_trace(images / "trace.png")
         write_views(images / "views.png")
         write_retraction(images / "retraction.png")
-        palpation = run_palpation(load_anatomy(make_scene("liver")), console=Console())
+        palpation = run_palpation(load_anatomy(make_scene("liver")))
         write_organ_picture(palpation, images / "palpation.png")
 
 

@@ -28,19 +28,12 @@ from surgsim_env.scene.load import (
 )
 from surgsim_env.scene.model import Port, Scene
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
-from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.channels import CONTACT_FORCE, TIME_LEFT, TIP_POSITION, TIP_VELOCITY
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, Setup
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.tasks.retract import RetractTask
-from surgsim_env.tasks.task import (
-    CONTACT_FORCE,
-    TIME_LEFT,
-    TIP_POSITION,
-    TIP_VELOCITY,
-    Start,
-    Task,
-    Verdict,
-)
+from surgsim_env.tasks.task import Task
 
 if TYPE_CHECKING:
     from surgsim_env import scripting
@@ -71,13 +64,12 @@ __all__ = [
     "RetractTask",
     "Reward",
     "Scene",
+    "Setup",
     "Simulation",
-    "Start",
     "Support",
     "SurgicalEnv",
     "Task",
     "VectorEnvForStableBaselines",
-    "Verdict",
     "list_arms",
     "list_materials",
     "list_scenes",

@@ -44,7 +44,7 @@ def test_video_example_runs_and_writes_a_video(tmp_path, monkeypatch):
 
 
 # A file of the checkout by its whole path; NAME and SEED stand for what a user puts there.
-FILE = re.compile(r"(?<![\w./-])(?:agents|docs|scenes|tests|surgsim_env|msdm_core)/[\w./-]*?\.[a-z]{2,4}\b")
+FILE = re.compile(r"(?<![\w./-])(?:agents|docs|scenes|tests|surgsim_\w+|msdm_core)/[\w./-]*?\.[a-z]{2,4}\b")
 NAMING = [ROOT / "README.md", ROOT / "agents" / "README.md", *sorted((ROOT / "agents").glob("*.py"))]
 
 

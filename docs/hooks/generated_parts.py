@@ -2,8 +2,8 @@
 
 `<!-- environment ID -->` becomes the docstring of that environment (Gymnasium's headings), whose tables of commands,
 channels and rewards come from the task's declaration; its spaces are added. `<!-- commands -->` becomes the help texts
-of `surgsim` and each of its commands. What stands from there to `<!-- made from the code -->` is for those who read
-the file itself, and is replaced.
+of `surgsim` and each of its commands, `<!-- fields OrganModel -->` the table of that structure's fields. What stands
+from there to `<!-- made from the code -->` is for those who read the file itself, and is replaced.
 """
 
 import contextlib
@@ -21,6 +21,7 @@ from mkdocs.structure.pages import Page
 
 ENVIRONMENT = re.compile(r"<!-- environment (\S+) -->\n.*?<!-- made from the code -->", re.DOTALL)
 COMMANDS = re.compile(r"<!-- commands -->\n.*?<!-- made from the code -->", re.DOTALL)
+FIELDS = re.compile(r"<!-- fields (\w+) -->\n.*?<!-- made from the code -->", re.DOTALL)
 # Wide enough for each option to be on one line.
 COLUMNS = {"COLUMNS": "4000"}
 
@@ -28,6 +29,7 @@ COLUMNS = {"COLUMNS": "4000"}
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Fill the marks in."""
     markdown = ENVIRONMENT.sub(lambda mark: environment_text(mark[1]), markdown)
+    markdown = FIELDS.sub(lambda mark: field_table(mark[1]), markdown)
     return COMMANDS.sub(lambda mark: command_list(), markdown)
 
 
@@ -89,6 +91,22 @@ def _lists_apart(text: str) -> str:
     """Markdown wants an empty line before a list or a table that follows a paragraph; 6-8 stays on one line."""
     apart = re.sub(r"^(?![*|\s])(.+)\n(?=[*|])", r"\1\n\n", text, flags=re.MULTILINE)
     return re.sub(r"^\| (\(?\d+)-(\d+\)?) \|", "| \\1\N{NON-BREAKING HYPHEN}\\2 |", apart, flags=re.MULTILINE)
+
+
+def field_table(structure: str) -> str:
+    """The fields of `OrganModel` or `OrganState`, and the layouts that they have in organs side by side."""
+    from msdm_core.kernels import structure_kernels as structures
+
+    table = {"OrganModel": structures.MODEL_FIELDS, "OrganState": structures.STATE_FIELDS}[structure]
+    rows = ["| field | unit | shape | type | side by side | |", "|---|---|---|---|---|---|"]
+    for field in table:
+        shape = ", ".join(map(str, field.shape)) or "scalar"
+        meaning = f"scratch: {field.meaning}" if field in structures.SCRATCH_FIELDS else field.meaning
+        cells = (f"`{field.name}`", field.unit, shape, field.dtype, field.lanes, meaning)
+        rows.append(f"| {' | '.join(cells)} |")
+    used = {field.lanes for field in table}
+    layouts = [f"* `{name}`: {meaning}" for name, meaning in structures.LAYOUTS.items() if name in used]
+    return "\n".join([*rows, "", *layouts])
 
 
 def command_list() -> str:

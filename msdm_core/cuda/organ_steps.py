@@ -47,6 +47,7 @@ from msdm_core.kernels.element_kernels import (
     volume_ratio,
 )  # fmt: skip
 from msdm_core.kernels.guard_kernels import FAR, guard_axes, near_axis, watched_distance
+from msdm_core.kernels.lane_view_kernels import SurfaceView, TouchedView
 from msdm_core.kernels.squeeze_kernels import hold_squeezed
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -54,9 +55,7 @@ from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
     FAULT_NOT_FINITE,
     ContactShapes,
-    SurfaceView,
     ToolResponse,
-    TouchedView,
 )  # fmt: skip
 from msdm_core.kernels.substep_kernels import move_shapes, push_tools
 

@@ -63,21 +63,21 @@ def _give_way(arm_tension, arm, elastic, fade):
 
 
 @njit(**INLINED)
-def _fade_arms(arm_modulus, arm_tension, relief, springs, first, elastic, fade):
+def _fade_arms(model, state, first, elastic, fade):
     """`tissue_kernels.fade_arms` of a group of springs."""
+    arm_modulus, arm_tension, springs = model.spring_arm_modulus, state.spring_arm_tension, model.spring_nodes.shape[0]
     second, third = springs + first, 2 * springs + first
     total = load_group(arm_modulus, first) * _give_way(arm_tension, first, elastic, fade[0])
     total = total + load_group(arm_modulus, second) * _give_way(arm_tension, second, elastic, fade[1])
     total = total + load_group(arm_modulus, third) * _give_way(arm_tension, third, elastic, fade[2])
-    store_group(relief, first, total)
+    store_group(state.spring_relief, first, total)
 
 
 @njit(**INNER)
-def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin):
-    """Energies of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_energies`.
-
-    Returns the first remaining spring.
-    """
+def add_energy_groups(model, state):
+    """`tissue_kernels.add_energies` of whole groups of springs; returns the first remaining spring."""
+    position, pairs, lengths, nodes = state.row_position, state.node_pairs, state.spring_lengths, model.spring_nodes
+    stiffness, rest_length, begin = model.spring_stiffness, model.spring_rest_length, model.tet_nodes.shape[0]
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
     for first in range(begin, whole, GROUP):
         x, y, z = columns(edge_rows(position, nodes, first))
@@ -89,11 +89,15 @@ def add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, b
 
 
 @njit(**INNER)
-def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
+def set_node_law_groups(model, state):
     """`tissue_kernels.set_node_laws` of whole groups of nodes.
 
     Returns the first remaining node, True if any stiffens, True if any is steep.
     """
+    pairs, steepness, inverse_volume, bulk = (
+        state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
+    )  # fmt: skip
+    softness, onset, growth, excess = model.node_softness, model.node_onset, model.node_growth, model.node_excess
     whole = pairs.shape[0] // GROUP * GROUP
     stiffens = steepens = False
     for first in range(0, whole, GROUP):
@@ -115,47 +119,47 @@ def set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, ex
 
 
 @njit(**INNER)
-def add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count):
-    """Forces of whole groups of springs from spring `begin` on; arguments as in `tissue_kernels.add_spring_forces`.
+def add_spring_groups(model, state, law):
+    """`tissue_kernels.add_spring_forces` of whole groups of springs.
 
-    Returns the first remaining spring and the number of entries in `law.steep`.
+    Returns the first remaining spring and the number of entries in `steep_springs`.
     """
-    measured, lengths, pairs = law.measured, law.lengths, law.pairs
-    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
-    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
-    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
-    springs = nodes.shape[0]
+    position, force, nodes, begin = state.row_position, state.row_force, model.spring_nodes, model.tet_nodes.shape[0]
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
+    steep_count = 0
     for first in range(begin, whole, GROUP):
         rows = edge_rows(position, nodes, first)
         x, y, z = columns(rows)
-        if measured:
+        if model.stiffens:
             length = load_group(lengths, first)
         else:
             length = spring_length(x, y, z)
         share = load_group(rest_length, first) / length
         rigidity = load_group(stiffness, first)
         scale = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             factor = end_sums(pairs, nodes, first)
             scale = scale * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 steep[steep_count] = first
                 steep_count += 1
-        if relaxes:
-            if fades:
-                _fade_arms(arm_modulus, arm_tension, relief, springs, first, scale / share, fade)
-            scale = scale * load_group(gain, first) - load_group(relief, first) * share
+        if model.relaxes:
+            if law.fades:
+                _fade_arms(model, state, first, scale / share, law.fade)
+            scale = scale * load_group(model.spring_gain, first) - load_group(state.spring_relief, first) * share
         pull_ends(force, nodes, first, (rows, scale))
     return whole, steep_count
 
 
 @njit(**INNER)
-def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
-    """Sums at nodes over whole groups of tets; arguments as in `tissue_kernels.sum_at_nodes`.
-
-    Returns the first remaining tet.
-    """
+def sum_tet_groups(model, state):
+    """`tissue_kernels.sum_at_nodes` of whole groups of tets; returns the first remaining tet."""
+    position, total, pairs, lengths = state.row_position, state.node_tension, state.node_pairs, state.spring_lengths
+    tets, stiffens = model.tet_nodes, model.stiffens
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
     whole = tets.shape[0] // GROUP * GROUP
     for first in range(0, whole, GROUP):
         b, c, d = tet_edges(position, tets, first)
@@ -171,49 +175,47 @@ def sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length
 
 
 @njit(**INNER)
-def add_tet_groups(
-    position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed, law,
-    steep_count,
-):  # fmt: skip
-    """Forces of whole groups of tets; arguments as in `tissue_kernels.add_tet_forces`.
+def add_tet_groups(model, state, law, steep_count):
+    """`tissue_kernels.add_tet_forces` of whole groups of tets.
 
-    Returns the first remaining tet, the number of groups with a squeezed tet and of entries in `law.steep`.
+    Returns the first remaining tet, the number of groups with a squeezed tet and of entries in `steep_springs`.
     """
-    measured, lengths, pairs = law.measured, law.lengths, law.pairs
-    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
-    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
-    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
-    springs = stiffness.shape[0]
+    position, force, tension, tets = state.row_position, state.row_force, state.node_tension, model.tet_nodes
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
+    low, squeezed = state.volume_ratio_smallest, state.squeezed_tets
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
     whole = tets.shape[0] // GROUP * GROUP
     count = 0
     lowest = spread_group(low[0])
     for first in range(0, whole, GROUP):
         b, c, d = tet_edges(position, tets, first)
         gradient, six = tet_shape(b, c, d)
-        ratio = volume_ratio(six, load_group(inverse_volume, first))
+        ratio = volume_ratio(six, load_group(model.tet_inverse_volume, first))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
             squeezed[count] = first
             count += 1
-        if measured:
+        if model.stiffens:
             averaged, factor = pair_sums(pairs, tets, first)
             length = load_group(lengths, first)
         else:
             averaged, length = corner_sums(tension, tets, first), spring_length(b[0], b[1], b[2])
             factor = length
-        scale = tet_scale(ratio, load_group(bulk, first), load_group(averaged_bulk, first), 0.25 * averaged)
+        bulk, averaged_bulk = load_group(model.tet_bulk, first), load_group(model.tet_averaged_bulk, first)
+        scale = tet_scale(ratio, bulk, averaged_bulk, 0.25 * averaged)
         share = load_group(rest_length, first) / length
         rigidity = load_group(stiffness, first)
         pull = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             pull = pull * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 steep[steep_count] = first
                 steep_count += 1
-        if relaxes:
-            if fades:
-                _fade_arms(arm_modulus, arm_tension, relief, springs, first, pull / share, fade)
-            pull = pull * load_group(gain, first) - load_group(relief, first) * share
+        if model.relaxes:
+            if law.fades:
+                _fade_arms(model, state, first, pull / share, law.fade)
+            pull = pull * load_group(model.spring_gain, first) - load_group(state.spring_relief, first) * share
         at_b = (
             scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
         )  # fmt: skip

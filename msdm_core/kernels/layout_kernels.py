@@ -12,6 +12,7 @@ from numba import njit
 
 from msdm_core.kernels.option_kernels import ALLOCATING_KERNEL, INLINED
 from msdm_core.kernels.vector_kernels import (
+    GROUP,
     define_extract,
     keep_lower,
     load_lanes,
@@ -22,6 +23,14 @@ from msdm_core.kernels.vector_kernels import (
 )
 
 _at_0, _at_1, _at_2 = define_extract(0), define_extract(1), define_extract(2)
+
+
+@njit(**INLINED)
+def group_width(lanes):
+    """Number of tets or springs in a row that an entry of `squeezed_tets` or `steep_springs` stands for."""
+    if len(lanes) == 0:
+        return GROUP
+    return 1
 
 
 @njit(**INLINED)

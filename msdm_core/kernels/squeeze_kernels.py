@@ -11,9 +11,11 @@ from msdm_core.kernels.element_kernels import (
     tet_shape,
     volume_ratio,
 )
+from msdm_core.kernels.lane_view_kernels import nodes_of
 from msdm_core.kernels.layout_kernels import (
     add_to_node,
     difference,
+    group_width,
     load_column,
     load_item,
     load_shared,
@@ -124,10 +126,7 @@ def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
 
 
 @njit(**KERNEL)
-def hold_steep(
-    lanes, position, velocity, force, inverse_mass, nodes, stiffness, steepness, gain, relaxes, tet_count, steep, count,
-    width, sweeps_least, sweeps_most, places, rows, speed, dt,
-):  # fmt: skip
+def hold_steep(lanes, model, state, count, sweeps_least, dt):
     """Implicit rise of the tangent of steep springs: tension T + dt K dl/dt at the step's end.
 
     K = STEEP_HOLD k q (1 + sum g_i), with q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy over
@@ -139,13 +138,15 @@ def hold_steep(
     the fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A
     spring at rest gets no force, so the static equilibrium does not depend on dt.
 
-    In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), nodes (n_spring, 2), stiffness [N/m]
-         (n_spring,), steepness (n_node,) of `node_law`, gain (n_spring,) as in `OrganModel`, relaxes, tet_count:
-         springs of tets, steep: first of each `width` successive springs with a steep spring, count: entries of
-         `steep`, width, sweeps_least, sweeps_most: even numbers, dt [s]
-    Out: force, added to [N] (n_node, 3); scratch: places (n_spring,), rows (n_spring, STEEP_WIDTH), speed [m/s]
-         (n_node, 3)
+    In:  count: entries of `steep_springs`, each the first of `group_width` successive springs with a steep spring,
+         sweeps_least: an even number as `steep_sweeps` of the model, dt [s]
+    Out: force of the nodes, added to
     """
+    position, velocity, force = nodes_of(lanes, state)
+    nodes, stiffness, inverse_mass = model.spring_nodes, model.spring_stiffness, model.node_inverse_mass
+    gain, relaxes, tet_count, width = model.spring_gain, model.relaxes, model.tet_nodes.shape[0], group_width(lanes)
+    steepness, steep, places = state.node_steepness, state.steep_springs, state.steep_places
+    rows, speed = state.steep_rows, state.steep_speed
     held = 0
     none = load_item(lanes, steepness, 0) * 0.0
     largest = none
@@ -176,7 +177,7 @@ def hold_steep(
             _set_speed(lanes, speed, velocity, force, inverse_mass, dt, j)
             held += 1
     wanted = SWEEPS_PER_TANGENT * (1.0 + largest)
-    for sweep in range(sweeps_most):
+    for sweep in range(model.steep_sweeps):
         pair = sweep - sweep % 2
         goes_on = none + 1.0
         if pair >= sweeps_least:

@@ -1,19 +1,16 @@
-"""Model, state, contact shapes, tools and contact law of organs: what the compiled code reads and writes.
+"""Model, state, contact shapes, tools and contact law of organs: the structures of the compiled code.
 
 An organ alone has `OrganModel` and `OrganState`; organs of the same tets that advance together, one a lane, have
-`LaneModel` and `LaneState`. The functions at the end give what contact and tools need of one lane; for an organ alone
-that is the whole. Arrays of models are read-only, which numba enforces at compile time.
+`LaneModel` and `LaneState`. MODEL_FIELDS and STATE_FIELDS are the one sheet of their fields: lanes, saved states, blank
+states and the documentation follow from it. Arrays of models are read-only, which numba enforces at compile time.
 """
 
 from collections import namedtuple
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
-from numba.extending import overload
 from numpy.typing import NDArray
-
-from msdm_core.kernels.option_kernels import INLINED, INLINED_VIEW, JITABLE
 
 FloatArray = NDArray[np.float64]
 # float64 or float32, eight or sixteen lanes.
@@ -26,62 +23,155 @@ FAULT_CONTACT_LOST = 3
 # Instead of a fault: the lane has no organ, or its organ must not move.
 LANE_EMPTY = -1
 
+# Layouts of a field in organs side by side.
+LAYOUTS = {
+    "shared": "as in an organ alone; of a state scratch for one lane after the other",
+    "own": "(..., n_lane) in the lanes' floating-point type, (n_lane,) of a scalar",
+    "rest": "as `own` if lanes have rest shapes of their own, else shared",
+    "rows": "(n_lane, ...), of which a lane uses as many rows as it has; of a model as `rest`",
+    "first": "shared, that of lane 0 if lanes have rest shapes of their own",
+    "turns": "(n_lane, ...) if organs stiffen, else (1, ...) for one lane after the other",
+    "halves": "(2, ..., n_lane)",
+    "alone": "only in an organ alone",
+}
 
-class OrganModel(NamedTuple):
-    """The constants of an organ: read-only arrays, SI units.
+
+class Field(NamedTuple):
+    """One field of an organ's model or state.
 
     Fields:
-        node_rest_position: undeformed position [m]                              (n_node, 3)
-        node_mass: lumped mass [kg]                                              (n_node,)
-        node_inverse_mass: 1 / mass [1/kg], 0 where the node is anchored         (n_node,)
-        spring_nodes: the two nodes of each spring; spring t is tet t's first edge (n_spring, 2)
-        spring_stiffness: [N/m]                                                  (n_spring,)
-        spring_rest_length: [m]                                                  (n_spring,)
-        stiffens: whether any spring stiffens with strain                        scalar
-        node_softness: 5 / sum of k l0^2 over the springs of a node [1/J]        (n_node,), (0,) if none stiffens
-        node_onset: e0 of its `Stiffening`                                       likewise
-        node_growth: 1 / (e1 - e0)                                               likewise
-        node_excess: (c - 1) (e1 - e0)                                           likewise
-        steep_rise: the least rise of a spring with a steepness of STEEP_EXCESS  scalar
-        steep_sweeps: the most of `hold_steep`                                   scalar
-        relaxes: whether any spring has Maxwell arms                             scalar
-        spring_gain: tension at once over that at equilibrium, 1 + sum g_i       (n_spring,), (0,) if none relaxes
-        spring_arm_modulus: g_i, arm by arm                                      (3 * n_spring,), likewise
-        arm_time: tau_i of all springs, inf for an arm that is not used [s]      (3,)
-        tet_nodes: corners of each tet                                           (n_tet, 4)
-        tet_rest_volume: [m^3]                                                   (n_tet,)
-        tet_inverse_volume: 1 / rest volume [1/m^3]                              (n_tet,)
-        tet_bulk: modulus of the volume term of each tet [Pa]                    (n_tet,)
-        tet_averaged_bulk: what a tet gives to the averaged volume term [Pa]     (n_tet,)
-        node_rest_volume: volume averaged at a node, a quarter of its tets [m^3] (n_node,)
-        node_inverse_volume: 1 / that [1/m^3]                                    (n_node,)
-        node_bulk: modulus of the volume term averaged at nodes [Pa]             (n_node,)
-        averages_volume: whether any node_bulk is above 0                        scalar
-        surface_triangles: outer triangles an instrument may touch, outward      (n_surface, 3)
-        surface_rest_area: [m^2]                                                 (n_surface,)
-        support_kind: the solids it rests on, PLANE, SPHERE, ...                 (n_support,)
-        support_position: its middle or a plane's point [m]                      (n_support, 3)
-        support_rotation: its axes in the world, one a column                    (n_support, 3, 3)
-        support_size: radius, half length, half sizes [m]                        (n_support, 3)
-        support_friction: Coulomb coefficient                                    (n_support,)
-        support_nodes: nodes that supports may hold: free ones of the surface    (n_support_node,)
-        support_area: surface area that belongs to each of them [m^2]            (n_support_node,)
-        support_stiffness: pressure per penetration [N/m^3]                      scalar
-        support_damping: pressure per closing speed [N s/m^3]                    scalar
-        support_tangential_stiffness: traction per stretch while sticking [N/m^3] scalar
-        foundation_nodes: nodes that elastic foundations hold                    (n_held,)
-        foundation_position: where those nodes are without force [m]             (n_held, 3)
-        foundation_stiffness: force per displacement, all foundations together [N/m] (n_held, 3, 3)
-        motion_node_shift: how far a unit of a motion's signal moves the ground [m], and 0 (n_motion, n_node, 4)
-        motion_anchored_nodes: anchored nodes of an organ whose ground moves     (n_anchored,)
-        motion_foundation_shift: the same of foundations, at the nodes they hold [m] (n_motion, n_held, 3)
-        motion_support_shift: the same of supports [m]                           (n_motion, n_support, 3)
-        gravity: [m/s^2]                                                         (3,)
-        alpha: mass-proportional damping rate [1/s]                              scalar
-        beta: stiffness-proportional damping time [s]                            scalar
-        stable_step: largest stable step without contact of instruments [s]      scalar
-        added_mass: how much of node_mass `stability.scale_mass` added [kg]      scalar
+        name: in `OrganModel` or `OrganState`
+        unit: SI, "" for pure numbers, flags and indices
+        shape: lengths in an organ alone, by number or by name; () for a scalar
+        lanes: one of LAYOUTS
+        meaning: for the documentation
+        dtype: in an organ alone
     """
+
+    name: str
+    unit: str
+    shape: tuple[int | str, ...]
+    lanes: str
+    meaning: str
+    dtype: str
+
+    def lengths(self, sizes: Mapping[int | str, int]) -> tuple[Any, ...]:
+        """The shape in an organ alone, from lengths by name."""
+        return tuple([sizes.get(length, length) for length in self.shape])
+
+
+def _field(name: str, unit: str, shape: str, lanes: str, meaning: str, dtype: str = "float64") -> Field:
+    """A field whose lengths are written as "n_node 3"."""
+    lengths = tuple(int(length) if length.isdigit() else length for length in shape.split())
+    return Field(name, unit, lengths, lanes, meaning, dtype)
+
+
+# Lengths: n_soft is n_node, n_steep n_spring and n_relaxing n_spring, or 0 if no spring stiffens or relaxes; n_arm is
+# 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.compile.state_sizes`.
+MODEL_FIELDS = (
+    _field("node_rest_position", "m", "n_node 3", "first", "undeformed position"),
+    _field("node_mass", "kg", "n_node", "own", "lumped mass"),
+    _field("node_inverse_mass", "1/kg", "n_node", "own", "1 / mass, 0 where the node is anchored"),
+    _field("spring_nodes", "", "n_spring 2", "shared", "both ends; spring t is tet t's first edge", "int32"),
+    _field("spring_stiffness", "N/m", "n_spring", "own", "k"),
+    _field("spring_rest_length", "m", "n_spring", "rest", "l0"),
+    _field("stiffens", "", "", "shared", "whether any spring stiffens with strain", "bool"),
+    _field("node_softness", "1/J", "n_soft", "own", "5 / sum of k l0^2 over the springs of a node"),
+    _field("node_onset", "", "n_soft", "shared", "e0 of its `Stiffening`"),
+    _field("node_growth", "", "n_soft", "shared", "1 / (e1 - e0)"),
+    _field("node_excess", "", "n_soft", "shared", "(c - 1) (e1 - e0)"),
+    _field("steep_rise", "", "", "shared", "least rise of a spring with a steepness of STEEP_EXCESS"),
+    _field("steep_sweeps", "", "", "shared", "most sweeps of `hold_steep`", "int64"),
+    _field("relaxes", "", "", "shared", "whether any spring has Maxwell arms", "bool"),
+    _field("spring_gain", "", "n_relaxing", "shared", "tension at once over that at equilibrium, 1 + sum g_i"),
+    _field("spring_arm_modulus", "", "n_arm", "shared", "g_i, arm by arm"),
+    _field("arm_time", "s", "3", "shared", "tau_i of all springs, inf for an arm that is not used"),
+    _field("tet_nodes", "", "n_tet 4", "shared", "corners of each tet", "int32"),
+    _field("tet_rest_volume", "m^3", "n_tet", "alone", "V0"),
+    _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
+    _field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
+    _field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
+    _field("node_rest_volume", "m^3", "n_node", "alone", "volume averaged at a node, a quarter of its tets"),
+    _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
+    _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
+    _field("averages_volume", "", "", "own", "whether any node_bulk is above 0", "bool"),
+    _field("surface_triangles", "", "n_surface 3", "rows", "triangles that may be touched, outward", "int32"),
+    _field("surface_rest_area", "m^2", "n_surface", "rows", ""),
+    _field("support_kind", "", "n_support", "shared", "the solids it rests on, PLANE, SPHERE, ...", "int32"),
+    _field("support_position", "m", "n_support 3", "shared", "middle of each, or a plane's point"),
+    _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world, one a column"),
+    _field("support_size", "m", "n_support 3", "shared", "radius, half length, half sizes"),
+    _field("support_friction", "", "n_support", "shared", "Coulomb coefficient"),
+    _field("support_nodes", "", "n_support_node", "rows", "free nodes that supports may hold", "int32"),
+    _field("support_area", "m^2", "n_support_node", "rows", "surface area that belongs to each of them"),
+    _field("support_stiffness", "N/m^3", "", "shared", "pressure per penetration"),
+    _field("support_damping", "N s/m^3", "", "shared", "pressure per closing speed"),
+    _field("support_tangential_stiffness", "N/m^3", "", "shared", "traction per stretch while sticking"),
+    _field("foundation_nodes", "", "n_held", "shared", "nodes that elastic foundations hold", "int32"),
+    _field("foundation_position", "m", "n_held 3", "rows", "where those nodes are without force"),
+    _field("foundation_stiffness", "N/m", "n_held 3 3", "rows", "force per displacement, all foundations together"),
+    _field("motion_node_shift", "m", "n_motion n_node 4", "rest", "way of the ground per unit of a signal, and 0"),
+    _field("motion_anchored_nodes", "", "n_anchored", "rows", "anchored nodes of an organ whose ground moves", "int64"),
+    _field("motion_foundation_shift", "m", "n_motion n_held 3", "rows", "likewise at the nodes of foundations"),
+    _field("motion_support_shift", "m", "n_motion n_support 3", "shared", "likewise of supports"),
+    _field("gravity", "m/s^2", "3", "shared", ""),
+    _field("alpha", "1/s", "", "shared", "mass-proportional damping rate"),
+    _field("beta", "s", "", "shared", "stiffness-proportional damping time"),
+    _field("stable_step", "s", "", "own", "largest stable step without contact of instruments"),
+    _field("added_mass", "kg", "", "alone", "part of node_mass that `stability.scale_mass` added"),
+)
+
+# Saved and restored.
+KEPT_FIELDS = (
+    _field("node_position", "m", "n_node 3", "own", ""),
+    _field("node_velocity", "m/s", "n_node 3", "own", ""),
+    _field("node_force", "N", "n_node 3", "own", "force of the last substep, without anchors' reactions"),
+    _field("spring_arm_tension", "N/m", "n_arm", "own", "tension over l0 that each arm has given way to, arm by arm"),
+    _field("spring_relief", "N/m", "n_relaxing", "own", "sum_i g_i times that"),
+    _field("contact_engaged", "", "n_shape n_point", "rows", "1 where a shape holds off a quadrature point", "uint8"),
+    _field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of sticking friction"),
+    _field("contact_passed", "", "2", "rows", "shape and triangle passed through, after such a fault", "int32"),
+    _field("support_stretch", "m", "n_support_node n_support 3", "rows", "tangential stretch of sticking nodes"),
+    _field("motion", "1, 1/s, 1/s, J", "n_motion 4", "rows", "signal, rate, rate before, work of the ground"),
+    _field("volume_ratio_smallest", "", "1", "own", "smallest V / V0 seen since it was last set to 1"),
+)
+
+# Written anew in every call: need not be saved.
+SCRATCH_FIELDS = (
+    _field("node_tension", "Pa", "n_node", "own", "tension of the averaged volume term"),
+    _field("row_position", "m", "n_node 4", "alone", "position in rows of four, which load as one"),
+    _field("row_velocity", "m/s", "n_node 4", "alone", "likewise"),
+    _field("row_force", "N", "n_node 4", "alone", "likewise"),
+    _field("squeezed_tets", "", "n_tet", "shared", "where tets are squeezed below SQUEEZED_RATIO", "int32"),
+    _field("node_pairs", "m^3, J; Pa, 1", "n_soft 2", "halves", "sums of volumes and energies, then see set_node_laws"),
+    _field("node_steepness", "", "n_soft", "own", "excess of the springs' tangent over 1"),
+    _field("spring_lengths", "m", "n_steep", "shared", "lengths of all springs"),
+    _field("steep_springs", "", "n_steep", "shared", "where springs are steep", "int32"),
+    _field("steep_places", "", "n_steep", "shared", "those springs, see squeeze_kernels", "int32"),
+    _field("steep_rows", "", "n_steep steep_width", "own", "likewise"),
+    _field("steep_speed", "m/s", "n_soft 3", "own", "speed that their nodes get to"),
+    _field("contact_candidates", "", "n_shape n_surface", "rows", "triangles in reach, shape by shape", "int32"),
+    _field("contact_rows", "", "n_row row_width", "turns", "a row for each point held off"),
+    _field("contact_places", "", "n_row place_width", "turns", "shape, point and nodes of each row", "int32"),
+    _field("contact_hold", "kg", "n_node", "shared", "hold of contact on a node, times dt^2"),
+    _field("ground_foundation", "m", "n_held 3", "rows", "where foundations hold nodes now"),
+    _field("ground_support", "m, m/s", "n_support 2 3", "rows", "position and velocity of supports now"),
+    _field("ground_load", "N", "n_support 3", "rows", "force of each support on the organ"),
+    _field("ground_rate", "1/s", "n_motion", "own", "rates of the motions' signals"),
+    _field("lane_fault", "", "1", "rows", "FAULT_ code of the last call", "int32"),
+    _field("moving", "", "1", "own", "1 until a fault stops the organ, then 0"),
+    _field("finite_sum", "", "1", "own", "finite where positions and velocities are"),
+    _field("candidate_count", "", "1", "rows", "candidates of the busiest shape", "int32"),
+    _field("contact_kept", "", "1", "rows", "0 where the surface passed through an axis", "uint8"),
+    _field("contact_count", "", "1", "rows", "rows of contact_rows and contact_places in use", "int32"),
+)
+
+STATE_FIELDS = KEPT_FIELDS + SCRATCH_FIELDS
+KEPT_NAMES = tuple(field.name for field in KEPT_FIELDS)
+
+
+class OrganModel(NamedTuple):
+    """The constants of an organ: read-only arrays, SI units, with the fields of MODEL_FIELDS."""
 
     node_rest_position: FloatArray
     node_mass: FloatArray
@@ -140,52 +230,19 @@ class OrganModel(NamedTuple):
 
 
 class OrganState(NamedTuple):
-    """What changes while an organ moves, SI units; all but SCRATCH_FIELDS is saved and restored.
-
-    Fields:
-        node_position: [m]                                                       (n_node, 3)
-        node_velocity: [m/s]                                                     (n_node, 3)
-        node_force: force of the last substep, without anchors' reactions [N]    (n_node, 3)
-        node_tension: scratch: tension of the averaged volume term [Pa]          (n_node,)
-        row_position: scratch: position in rows of four, which load as one       (n_node, 4)
-        row_velocity: scratch: likewise                                          (n_node, 4)
-        row_force: scratch: likewise                                             (n_node, 4)
-        squeezed_tets: scratch: where tets are squeezed below SQUEEZED_RATIO     (n_tet,)
-        node_pairs: scratch: sums of volumes [m^3] and energies [J] around nodes, then tension [Pa] and half the factor
-            on springs, see tissue_kernels.set_node_laws                         (n_node, 2), (0, 2) if none stiffens
-        node_steepness: scratch: what the springs' tangent is above 1            (n_node,), (0,) if none stiffens
-        spring_lengths: scratch: [m]                                             (n_spring,), likewise
-        steep_springs: scratch: where springs are steep                          (n_spring,), (0,) if none stiffens
-        steep_places: scratch: those springs, see squeeze_kernels                (n_spring,), likewise
-        steep_rows: scratch: likewise                                            (n_spring, STEEP_WIDTH), likewise
-        steep_speed: scratch: speed that their nodes get to [m/s]                (n_node, 3), (0, 3) if none stiffens
-        spring_arm_tension: what each arm has given way to, over l0, arm by arm [N/m] (3 * n_spring,), (0,) without arms
-        spring_relief: sum_i g_i times that [N/m]                                (n_spring,), (0,) without arms
-        contact_engaged: 1 where a quadrature point is held off by a shape       (n_shape, n_surface * 4)
-        contact_stretch: tangential stretch of sticking friction [m]             (n_shape, n_surface * 4, 3)
-        contact_candidates: scratch: triangles in reach, shape by shape          (n_shape, n_surface)
-        contact_rows: scratch: one a point held off, see contact_kernels         (n_shape * n_surface * 4, ROW_WIDTH)
-        contact_places: scratch: whose they are                                  (n_shape * n_surface * 4, PLACE_WIDTH)
-        contact_hold: scratch: what contact holds a node with, times dt^2 [kg]   (n_node,)
-        contact_passed: the shape and the triangle it passed through, after such a fault  (2,)
-        support_stretch: tangential stretch of nodes that stick to supports [m]  (n_support_node, n_support, 3)
-        motion: signal, its rate, rate of the substep before [1/s], work of the ground on the organ [J] (n_motion, 4)
-        ground_foundation: scratch: where foundations hold nodes now [m]         (n_held, 3)
-        ground_support: scratch: position [m] and velocity [m/s] of supports now (n_support, 2, 3)
-        ground_load: scratch: force of each support on the organ [N]             (n_support, 3)
-        ground_rate: scratch: rates of the motions' signals [1/s]                (n_motion,)
-        volume_ratio_smallest: smallest V / V0 seen since it was last set to 1   (1,)
-        lane_fault: scratch: FAULT_ code of the last call                        (1,)
-        moving: scratch: 1 until a fault stops the organ, then 0                 (1,)
-        finite_sum: scratch: finite where positions and velocities are           (1,)
-        candidate_count: scratch: candidates of the busiest shape                (1,)
-        contact_kept: scratch: 0 where the surface passed through an axis        (1,)
-        contact_count: scratch: rows of contact_rows and contact_places in use   (1,)
-    """
+    """The changing numbers of an organ that moves, SI units, with the fields of STATE_FIELDS."""
 
     node_position: FloatArray
     node_velocity: FloatArray
     node_force: FloatArray
+    spring_arm_tension: FloatArray
+    spring_relief: FloatArray
+    contact_engaged: NDArray[np.uint8]
+    contact_stretch: FloatArray
+    contact_passed: NDArray[np.int32]
+    support_stretch: FloatArray
+    motion: FloatArray
+    volume_ratio_smallest: FloatArray
     node_tension: FloatArray
     row_position: FloatArray
     row_velocity: FloatArray
@@ -198,22 +255,14 @@ class OrganState(NamedTuple):
     steep_places: NDArray[np.int32]
     steep_rows: FloatArray
     steep_speed: FloatArray
-    spring_arm_tension: FloatArray
-    spring_relief: FloatArray
-    contact_engaged: NDArray[np.uint8]
-    contact_stretch: FloatArray
     contact_candidates: NDArray[np.int32]
     contact_rows: FloatArray
     contact_places: NDArray[np.int32]
     contact_hold: FloatArray
-    contact_passed: NDArray[np.int32]
-    support_stretch: FloatArray
-    motion: FloatArray
     ground_foundation: FloatArray
     ground_support: FloatArray
     ground_load: FloatArray
     ground_rate: FloatArray
-    volume_ratio_smallest: FloatArray
     lane_fault: NDArray[np.int32]
     moving: FloatArray
     finite_sum: FloatArray
@@ -222,65 +271,26 @@ class OrganState(NamedTuple):
     contact_count: NDArray[np.int32]
 
 
-# Written anew in every call: need not be saved.
-SCRATCH_FIELDS = (
-    *("node_tension", "row_position", "row_velocity", "row_force", "squeezed_tets"),
-    *("node_pairs", "node_steepness", "spring_lengths", "steep_springs", "steep_places", "steep_rows", "steep_speed"),
-    *("contact_candidates", "contact_rows", "contact_places", "contact_hold"),
-    *("ground_foundation", "ground_support", "ground_load", "ground_rate"),
-    *("lane_fault", "moving", "finite_sum", "candidate_count", "contact_kept", "contact_count"),
-)
+def _in_lanes(fields: tuple[Field, ...]) -> list[str]:
+    """The names of the fields that organs side by side have too."""
+    return [field.name for field in fields if field.lanes != "alone"]
 
 
 LaneModel = namedtuple(
-    "LaneModel",
-    (
-        "lanes",
-        *(name for name in OrganModel._fields if name not in ("tet_rest_volume", "node_rest_volume", "added_mass")),
-        *("surface_count", "support_count", "anchor_count"),
-    ),
+    "LaneModel", ("lanes", *_in_lanes(MODEL_FIELDS), "surface_count", "support_count", "anchor_count")
 )
-LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units; tets are shared.
+LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units, in the layouts of MODEL_FIELDS.
 
-Fields are those of OrganModel, and `lanes`: as many zeros as there are lanes, so that their number is part of the
-compiled type. Each lane has its own node_mass, node_inverse_mass, spring_stiffness, node_softness, tet_bulk,
-tet_averaged_bulk and node_bulk (n, n_lane), and its own averages_volume and stable_step (n_lane,).
-
-Rest shapes and anchors are shared too, or each lane's own. spring_rest_length, tet_inverse_volume, node_inverse_volume
-and motion_node_shift are then (..., n_lane), and those of surface, supports and foundations have the lane as their
-first index; of the surface, of supports and of anchored nodes a lane uses as many rows as it has: surface_count,
-support_count and anchor_count (n_lane,). node_rest_position is that of lane 0 if they differ.
+`lanes` are as many zeros as there are lanes, so that their number is part of the compiled type. Of the surface, of
+supports and of anchored nodes a lane uses as many rows as it has: surface_count, support_count and anchor_count
+(n_lane,).
 """
 
-# Fields of the state that have the lane as last index in lanes, in their floating-point type; as first index; those
-# with one number a lane; and scratch that one lane uses after the other.
-LANE_COLUMNS = (
-    *("node_position", "node_velocity", "node_force", "spring_arm_tension", "spring_relief", "volume_ratio_smallest"),
-    *("node_tension", "node_steepness", "steep_rows", "steep_speed", "ground_rate", "moving", "finite_sum"),
-)
-LANE_ROWS = (
-    *("contact_engaged", "contact_stretch", "contact_candidates", "contact_passed", "support_stretch", "motion"),
-    *("ground_foundation", "ground_support", "ground_load"),
-)
-LANE_NUMBERS = ("lane_fault", "candidate_count", "contact_kept", "contact_count")
-LANE_SHARED = ("squeezed_tets", "spring_lengths", "steep_springs", "steep_places", "contact_hold")
+LaneState = namedtuple("LaneState", (*_in_lanes(STATE_FIELDS), "kept_force", "surface_count", "support_count"))
+LaneState.__doc__ = """The changing numbers of organs that move side by side, SI units, in the layouts of STATE_FIELDS.
 
-LaneState = namedtuple(
-    "LaneState",
-    (
-        *(*LANE_COLUMNS, *LANE_ROWS, *LANE_NUMBERS, *LANE_SHARED),
-        *("node_pairs", "contact_rows", "contact_places", "kept_force", "surface_count", "support_count"),
-    ),
-)
-LaneState.__doc__ = """What changes while organs side by side move, SI units.
-
-Fields are those of OrganState without its rows of four: LANE_COLUMNS (..., n_lane), LANE_ROWS (n_lane, ...),
-LANE_NUMBERS (n_lane,), of which lane_fault is LANE_EMPTY where no organ is, LANE_SHARED; and
-    node_pairs: scratch: as in OrganState                                        (2, n_node, n_lane), (2, 0, n_lane)
-    contact_rows, contact_places: scratch: as in OrganState, of each lane if organs stiffen, else of one lane after
-        the other                                                                (n_lane or 1, n_row, ROW_WIDTH), ...
-    kept_force: scratch: node_force of the lanes that do not move [N]            (n_node, 3, n_lane)
-    surface_count, support_count: how much of the memory belongs to a lane       (n_lane,)
+lane_fault is LANE_EMPTY where no organ is; `kept_force` is scratch: node_force of the lanes that do not move [N]
+(n_node, 3, n_lane); surface_count and support_count are how much of the memory belongs to a lane (n_lane,).
 """
 
 
@@ -339,267 +349,3 @@ class ContactLaw(NamedTuple):
     damping: float
     friction: float
     tangential_stiffness: float
-
-
-class SpringLaw(NamedTuple):
-    """How springs depart from linear ones in one substep: fields of model and state, and what the arms lose.
-
-    Fields:
-        measured: `stiffens` of the model: node_pairs and, of an organ alone, spring_lengths of the state are set
-        stiffens: whether springs of any node have a factor other than 1
-        steepens: whether any node has a steepness above STEEP_EXCESS
-        pairs, lengths, steep: `node_pairs`, `spring_lengths`, `steep_springs` of the state
-        steep_sum: least sum of the halves of a spring's two ends where it may be steep
-        relaxes, gain, arm_modulus: `relaxes`, `spring_gain` and `spring_arm_modulus` of the model
-        arm_tension, relief: `spring_arm_tension` and `spring_relief` of the state
-        fades: whether the arms give way in this substep
-        fade: share of its tension that each arm then loses
-    """
-
-    measured: bool
-    stiffens: bool
-    steepens: bool
-    pairs: LaneArray
-    lengths: FloatArray
-    steep: NDArray[np.int32]
-    steep_sum: float
-    relaxes: bool
-    gain: FloatArray
-    arm_modulus: FloatArray
-    arm_tension: LaneArray
-    relief: LaneArray
-    fades: bool
-    fade: tuple[float, float, float]
-
-
-class SurfaceView(NamedTuple):
-    """What contact reads of one lane's model."""
-
-    surface_triangles: NDArray[np.int32]
-    surface_rest_area: FloatArray
-    node_inverse_mass: LaneArray
-
-
-class _Supports(NamedTuple):
-    """What supports read of one lane's model."""
-
-    support_kind: NDArray[np.int32]
-    support_position: FloatArray
-    support_rotation: FloatArray
-    support_size: FloatArray
-    support_friction: FloatArray
-    support_nodes: NDArray[np.int32]
-    support_area: FloatArray
-    support_stiffness: float
-    support_damping: float
-    support_tangential_stiffness: float
-
-
-class _Ground(NamedTuple):
-    """What elastic foundations and the ground's motion read of one lane's model."""
-
-    support_position: FloatArray
-    foundation_nodes: NDArray[np.int32]
-    foundation_position: FloatArray
-    foundation_stiffness: FloatArray
-    motion_node_shift: LaneArray
-    motion_anchored_nodes: NDArray[np.intp]
-    motion_foundation_shift: FloatArray
-    motion_support_shift: FloatArray
-
-
-class TouchedView(NamedTuple):
-    """What contact reads and writes of one lane's state."""
-
-    node_position: LaneArray
-    node_velocity: LaneArray
-    node_force: LaneArray
-    contact_engaged: NDArray[np.uint8]
-    contact_stretch: FloatArray
-    contact_candidates: NDArray[np.int32]
-    contact_rows: FloatArray
-    contact_places: NDArray[np.int32]
-    contact_hold: FloatArray
-    contact_passed: NDArray[np.int32]
-
-
-def lanes_of(model: OrganModel | LaneModel) -> tuple[int, ...]:
-    """As many zeros as there are organs side by side; none for an organ alone."""
-    return model.lanes if isinstance(model, LaneModel) else ()
-
-
-@overload(lanes_of, jit_options=JITABLE)
-def _(model):
-    return (lambda model: model.lanes) if model.instance_class is LaneModel else (lambda model: ())
-
-
-# Whether `lanes` is empty, and how many indices an array has, is known when these are compiled: one way is left.
-
-
-@njit(**INLINED)
-def entry_of(values, lane):
-    """One lane's number of an array (1, n_lane), or that of an organ alone in an array (1,)."""
-    if values.ndim == 2:
-        return values[0, lane]
-    return values[lane]
-
-
-@njit(**INLINED)
-def set_entry(values, lane, value):
-    """Write what `entry_of` reads."""
-    if values.ndim == 2:
-        values[0, lane] = value
-    else:
-        values[lane] = value
-
-
-@njit(**INLINED_VIEW)
-def column_of(values, lane):
-    """One lane's numbers of an array (n, n_lane), or of all lanes' array (n,)."""
-    if values.ndim == 2:
-        return values[:, lane]
-    return values
-
-
-@njit(**INLINED_VIEW)
-def part_of(lanes, values, lane):
-    """One lane's part of an array whose first index is the lane; an organ alone has the whole array."""
-    if len(lanes) == 0:
-        return values
-    return values[lane]
-
-
-@njit(**INLINED_VIEW)
-def _triangles_of(values, lane, count):
-    if values.ndim == 3:
-        return values[lane, :count]
-    return values
-
-
-@njit(**INLINED_VIEW)
-def _numbers_of(values, lane, count):
-    if values.ndim == 2:
-        return values[lane, :count]
-    return values
-
-
-@njit(**INLINED)
-def surface_of(lanes, model, lane):
-    """One lane's surface, as contact reads it."""
-    if len(lanes) == 0:
-        return SurfaceView(model.surface_triangles, model.surface_rest_area, model.node_inverse_mass)
-    count = model.surface_count[lane]
-    return SurfaceView(
-        _triangles_of(model.surface_triangles, lane, count), _numbers_of(model.surface_rest_area, lane, count),
-        model.node_inverse_mass[:, lane],
-    )  # fmt: skip
-
-
-@njit(**INLINED)
-def supports_of(lanes, model, lane):
-    """One lane's supports; kernels that read them take an OrganModel as well."""
-    if len(lanes) == 0:
-        return _Supports(
-            model.support_kind, model.support_position, model.support_rotation, model.support_size,
-            model.support_friction, model.support_nodes, model.support_area,
-            model.support_stiffness, model.support_damping, model.support_tangential_stiffness,
-        )  # fmt: skip
-    count = model.support_count[lane]
-    return _Supports(
-        model.support_kind, model.support_position, model.support_rotation, model.support_size, model.support_friction,
-        _numbers_of(model.support_nodes, lane, count), _numbers_of(model.support_area, lane, count),
-        model.support_stiffness, model.support_damping, model.support_tangential_stiffness,
-    )  # fmt: skip
-
-
-@njit(**INLINED_VIEW)
-def _places_of(values, lane):
-    if values.ndim == 3:
-        return values[lane]
-    return values
-
-
-@njit(**INLINED_VIEW)
-def _blocks_of(values, lane):
-    if values.ndim == 4:
-        return values[lane]
-    return values
-
-
-@njit(**INLINED_VIEW)
-def _shifts_of(values, lane):
-    if values.ndim == 4:
-        return values[:, :, :, lane]
-    return values
-
-
-@njit(**INLINED)
-def ground_of(lanes, model, lane):
-    """One lane's foundations, and how the ground moves; kernels that read them take an OrganModel as well."""
-    if len(lanes) == 0:
-        return model
-    return _Ground(
-        model.support_position, model.foundation_nodes, _places_of(model.foundation_position, lane),
-        _blocks_of(model.foundation_stiffness, lane), _shifts_of(model.motion_node_shift, lane),
-        _numbers_of(model.motion_anchored_nodes, lane, model.anchor_count[lane]),
-        _blocks_of(model.motion_foundation_shift, lane), model.motion_support_shift,
-    )  # fmt: skip
-
-
-@njit(**INLINED)
-def touched_of(lanes, state, lane):
-    """One lane's state, as contact reads and writes it."""
-    if len(lanes) == 0:
-        return TouchedView(
-            state.node_position, state.node_velocity, state.node_force,
-            state.contact_engaged, state.contact_stretch, state.contact_candidates,
-            state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
-        )  # fmt: skip
-    room = lane if state.contact_rows.shape[0] > 1 else 0
-    return TouchedView(
-        state.node_position[:, :, lane], state.node_velocity[:, :, lane], state.node_force[:, :, lane],
-        state.contact_engaged[lane], state.contact_stretch[lane], state.contact_candidates[lane],
-        state.contact_rows[room], state.contact_places[room], state.contact_hold, state.contact_passed[lane],
-    )  # fmt: skip
-
-
-@njit(**INLINED)
-def shapes_of(lanes, shapes, lane):
-    """One lane's contact shapes."""
-    if len(lanes) == 0:
-        return shapes
-    return ContactShapes(
-        shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
-        shapes.tool_twist[lane], shapes.shape_span[lane], shapes.shape_friction[lane],
-    )  # fmt: skip
-
-
-@njit(**INLINED)
-def response_of(lanes, response, lane):
-    """The response of one lane's tools."""
-    if len(lanes) == 0:
-        return response
-    return ToolResponse(
-        response.tool_acceleration[lane], response.tool_mobility[lane], response.tool_wrench[lane],
-        response.tool_lag[lane],
-    )  # fmt: skip
-
-
-@njit(**INLINED)
-def in_rows(lanes, state):
-    """The state whose node arrays the tissue's kernels work on: of an organ alone with rows of four in their place."""
-    if len(lanes) > 0:
-        return state
-    return OrganState(
-        state.row_position, state.row_velocity, state.row_force, state.node_tension,
-        state.row_position, state.row_velocity, state.row_force, state.squeezed_tets,
-        state.node_pairs, state.node_steepness, state.spring_lengths,
-        state.steep_springs, state.steep_places, state.steep_rows, state.steep_speed,
-        state.spring_arm_tension, state.spring_relief,
-        state.contact_engaged, state.contact_stretch, state.contact_candidates,
-        state.contact_rows, state.contact_places, state.contact_hold, state.contact_passed,
-        state.support_stretch,
-        state.motion, state.ground_foundation, state.ground_support, state.ground_load, state.ground_rate,
-        state.volume_ratio_smallest, state.lane_fault, state.moving, state.finite_sum, state.candidate_count,
-        state.contact_kept, state.contact_count,
-    )  # fmt: skip

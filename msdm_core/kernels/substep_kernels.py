@@ -13,20 +13,13 @@ from numba import njit
 from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
-from msdm_core.kernels.layout_kernels import load_part, store_part
-from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
-from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
-from msdm_core.kernels.structure_kernels import (
-    FAULT_CONTACT_LOST,
-    FAULT_INVERTED_TET,
-    FAULT_NONE,
-    FAULT_NOT_FINITE,
+from msdm_core.kernels.lane_view_kernels import (
     SpringLaw,
     column_of,
     entry_of,
     ground_of,
-    in_rows,
     lanes_of,
+    nodes_of,
     part_of,
     response_of,
     set_entry,
@@ -34,6 +27,15 @@ from msdm_core.kernels.structure_kernels import (
     supports_of,
     surface_of,
     touched_of,
+)
+from msdm_core.kernels.layout_kernels import group_width, load_part, store_part
+from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
+from msdm_core.kernels.structure_kernels import (
+    FAULT_CONTACT_LOST,
+    FAULT_INVERTED_TET,
+    FAULT_NONE,
+    FAULT_NOT_FINITE,
 )
 from msdm_core.kernels.support_kernels import (
     add_foundation_forces,
@@ -50,7 +52,6 @@ from msdm_core.kernels.tissue_kernels import (
     add_tet_forces,
     add_volume_damping,
     add_volume_rates,
-    group_width,
     integrate,
     put_back,
     set_gravity,
@@ -151,51 +152,29 @@ def _evaluate(model, state, fades, fade_duration):
             faded_share(fade_duration, time[0]), faded_share(fade_duration, time[1]),
             faded_share(fade_duration, time[2]),
         )  # fmt: skip
-    lanes, beta, tets = lanes_of(model), model.beta, model.tet_nodes
-    position, velocity, force, tension = state.node_position, state.node_velocity, state.node_force, state.node_tension
-    averages, stiffens = _averages(lanes, model.averages_volume), model.stiffens
-    pairs, lengths = state.node_pairs, state.spring_lengths
+    lanes, beta = lanes_of(model), model.beta
+    averages, stiffens, steepens = _averages(lanes, model.averages_volume), model.stiffens, False
     if stiffens:
-        pairs[:] = 0.0
+        state.node_pairs[:] = 0.0
     else:
-        tension[:] = 0.0
+        state.node_tension[:] = 0.0
     if averages or stiffens:
-        sum_at_nodes(
-            lanes, position, tension, pairs, lengths, tets, model.spring_stiffness, model.spring_rest_length, stiffens
-        )
+        sum_at_nodes(lanes, model, state)
     if averages and beta > 0.0:
-        add_volume_rates(lanes, position, velocity, tension, pairs, tets, beta, stiffens)
-    steepens = False
+        add_volume_rates(lanes, model, state)
     if stiffens:
-        add_energies(
-            lanes, position, pairs, lengths, model.spring_nodes, model.spring_stiffness, model.spring_rest_length,
-            tets.shape[0],
-        )  # fmt: skip
-        stiffens, steepens = set_node_laws(
-            lanes, pairs, model.node_inverse_volume, model.node_bulk, model.node_softness, model.node_onset,
-            model.node_growth, model.node_excess, state.node_steepness,
-        )  # fmt: skip
+        add_energies(lanes, model, state)
+        stiffens, steepens = set_node_laws(lanes, model, state)
     elif averages:
-        set_node_tension(lanes, tension, model.node_inverse_volume, model.node_bulk)
-    law = SpringLaw(
-        model.stiffens, stiffens, steepens, pairs, lengths, state.steep_springs, 1.0 + model.steep_rise,
-        model.relaxes, model.spring_gain, model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief,
-        fades, fade,
-    )  # fmt: skip
-    set_gravity(lanes, force, model.node_mass, model.gravity)
-    steep_count = add_spring_forces(
-        lanes, position, force, model.spring_nodes, model.spring_stiffness, model.spring_rest_length, tets.shape[0],
-        law, state.moving,
-    )  # fmt: skip
+        set_node_tension(lanes, state.node_tension, model.node_inverse_volume, model.node_bulk)
+    law = SpringLaw(stiffens, steepens, fades, fade)
+    set_gravity(lanes, model, state)
+    steep_count = add_spring_forces(lanes, model, state, law)
     if beta > 0.0:
-        add_spring_damping(lanes, position, velocity, force, model.spring_nodes, model.spring_stiffness, beta)
-    squeezed_count, steep_count = add_tet_forces(
-        lanes, position, force, tension, tets, model.tet_inverse_volume, model.tet_bulk, model.tet_averaged_bulk,
-        model.spring_stiffness, model.spring_rest_length, state.volume_ratio_smallest, state.moving,
-        state.squeezed_tets, law, steep_count,
-    )  # fmt: skip
+        add_spring_damping(lanes, model, state)
+    squeezed_count, steep_count = add_tet_forces(lanes, model, state, law, steep_count)
     if beta > 0.0:
-        add_volume_damping(lanes, position, velocity, force, tets, model.tet_inverse_volume, model.tet_bulk, beta)
+        add_volume_damping(lanes, model, state)
     return squeezed_count, steep_count
 
 
@@ -226,7 +205,7 @@ def _keep_forces(lanes, state):
 def _put_back_forces(lanes, state):
     """Restore the forces of lanes that do not move."""
     if len(lanes) > 0:
-        put_back(lanes, state.node_force, state.kept_force, state.moving)
+        put_back(lanes, state)
 
 
 @njit(**INLINED)
@@ -355,12 +334,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
         if steep_count == 0:
             _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
     if steep_count > 0 and moving > 0:
-        hold_steep(
-            lanes, state.node_position, state.node_velocity, state.node_force, model.node_inverse_mass,
-            model.spring_nodes, model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes,
-            model.tet_nodes.shape[0], state.steep_springs, steep_count, group_width(lanes),
-            SWEEPS_LEAST, model.steep_sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
-        )  # fmt: skip
+        hold_steep(lanes, model, state, steep_count, SWEEPS_LEAST, dt)
         for lane in range(_lane_count(lanes)):
             if state.lane_fault[lane] == FAULT_NONE:
                 _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane)
@@ -372,7 +346,8 @@ def _move_ground(lanes, model, state, dt, decay):
     """Move what holds the organs that move: anchored nodes by the integration that follows, the others at once."""
     if model.motion_node_shift.shape[0] == 0:
         return
-    drag_along(lanes, model.motion_node_shift, state.ground_rate, state.moving, decay, state.node_velocity)
+    _, velocity, _ = nodes_of(lanes, state)
+    drag_along(lanes, model.motion_node_shift, state.ground_rate, state.moving, decay, velocity)
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
             continue
@@ -433,28 +408,26 @@ def advance_inside(model, state, shapes, law, response, dt, decay, substep_count
     wrench[:] = 0.0
     _wake(lanes, state)
     _load_rows(lanes, state)
-    rows = in_rows(lanes, state)
-    _begin(lanes, model, rows, shapes, response, dt * substep_count)
+    _begin(lanes, model, state, shapes, response, dt * substep_count)
     fade_every = max(1, int(FADE_INTERVAL / dt + 0.5))
     faded = 0
     for substep in range(substep_count):
         fades = model.relaxes and (substep + 1 == substep_count or substep + 1 - faded == fade_every)
-        squeezed_count, steep_count = _evaluate(model, rows, fades, (substep + 1 - faded) * dt)
+        squeezed_count, steep_count = _evaluate(model, state, fades, (substep + 1 - faded) * dt)
         if fades:
             faded = substep + 1
         if (
-            _touch(lanes, model, rows, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench)
+            _touch(
+                lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench
+            )
             == 0
         ):
             break
-        _move_ground(lanes, model, rows, dt, decay)
-        integrate(
-            lanes, rows.node_position, rows.node_velocity, rows.node_force, model.node_inverse_mass, dt, decay,
-            rows.moving, rows.finite_sum,
-        )  # fmt: skip
-        if _move_tools(lanes, rows, shapes, response, dt, substep, wrench) == 0:
+        _move_ground(lanes, model, state, dt, decay)
+        integrate(lanes, model, state, dt, decay)
+        if _move_tools(lanes, state, shapes, response, dt, substep, wrench) == 0:
             break
-    _end(lanes, model, rows, shapes, law, response, substep_count, wrench)
+    _end(lanes, model, state, shapes, law, response, substep_count, wrench)
     _store_motion(lanes, state)
     _store_force(lanes, state)
     return state.lane_fault[0]
@@ -484,5 +457,5 @@ def evaluate_forces(model, state):
     """
     lanes = lanes_of(model)
     _load_rows(lanes, state)
-    _evaluate(model, in_rows(lanes, state), False, 0.0)
+    _evaluate(model, state, False, 0.0)
     _store_force(lanes, state)

@@ -31,6 +31,7 @@ from msdm_core.kernels.group_kernels import (
     set_node_law_groups,
     sum_tet_groups,
 )
+from msdm_core.kernels.lane_view_kernels import nodes_of
 from msdm_core.kernels.layout_kernels import (
     add_half,
     add_to_corners,
@@ -39,6 +40,7 @@ from msdm_core.kernels.layout_kernels import (
     corner_mean,
     corner_mean_of_pairs,
     difference,
+    group_width,
     load_half,
     load_item,
     load_part,
@@ -53,24 +55,14 @@ from msdm_core.kernels.layout_kernels import (
     where_moving,
 )
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
-from msdm_core.kernels.vector_kernels import GROUP, any_below, keep_lower
-
-
-@njit(**INLINED)
-def group_width(lanes):
-    """Number of successive tets per entry of `squeezed_tets`."""
-    if len(lanes) == 0:
-        return GROUP
-    return 1
+from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 
 @njit(**INNER)
-def set_gravity(lanes, force, mass, gravity):
-    """F = m g.
-
-    In:  mass [kg] (n_node,), gravity [m/s^2] (3,)
-    Out: force [N] (n_node, 4)
-    """
+def set_gravity(lanes, model, state):
+    """F = m g into the forces."""
+    _, _, force = nodes_of(lanes, state)
+    mass, gravity = model.node_mass, model.gravity
     for node in range(force.shape[0]):
         if len(lanes) == 0:
             for axis in range(3):
@@ -82,12 +74,10 @@ def set_gravity(lanes, force, mass, gravity):
 
 
 @njit(**INNER)
-def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving, finite_sum):
-    """Symplectic Euler step of the moving organs: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt).
-
-    In:  force [N] (n_node, 4), inverse_mass [1/kg] (n_node,), dt [s], decay, moving: 1 for a moving organ (1,)
-    Out: position [m], velocity [m/s] (n_node, 4), finite_sum: finite if all of an organ's numbers are (1,)
-    """
+def integrate(lanes, model, state, dt, decay):
+    """Symplectic Euler step of the moving organs: v = decay v + dt f / m, x = x + dt v, decay = e^(-alpha dt)."""
+    position, velocity, force = nodes_of(lanes, state)
+    inverse_mass, moving = model.node_inverse_mass, state.moving
     parts = parts_of(lanes)
     check = load_part(lanes, position, 0) * 0.0
     for node in range(position.shape[0]):
@@ -99,16 +89,13 @@ def integrate(lanes, position, velocity, force, inverse_mass, dt, decay, moving,
             store_part(lanes, velocity, part, where_moving(lanes, moving, speed, speed_before))
             store_part(lanes, position, part, where_moving(lanes, moving, place, place_before))
             check = check + (place + speed)
-    store_sum(lanes, finite_sum, check)
+    store_sum(lanes, state.finite_sum, check)
 
 
 @njit(**INNER)
-def put_back(lanes, values, kept, moving):
-    """Restore the kept values of stopped organs.
-
-    In:  kept (n_node, 3, n_lane), moving: 1 for a moving organ (1, n_lane)
-    Out: values (n_node, 3, n_lane)
-    """
+def put_back(lanes, state):
+    """Restore the kept forces of stopped organs."""
+    values, kept, moving = state.node_force, state.kept_force, state.moving
     for part in range(3 * values.shape[0]):
         value = where_moving(lanes, moving, load_part(lanes, values, part), load_part(lanes, kept, part))
         store_part(lanes, values, part, value)
@@ -126,14 +113,6 @@ def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
 def _end_sum(lanes, pairs, items, item):
     """Sum of the second numbers of the pairs of a spring's two ends."""
     return load_half(lanes, pairs, items[item, 0], 1) + load_half(lanes, pairs, items[item, 1], 1)
-
-
-@njit(**INLINED)
-def _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
-    """`add_energy_groups` for an organ alone; returns the first remaining spring."""
-    if len(lanes) == 0:
-        return add_energy_groups(position, pairs, lengths, nodes, stiffness, rest_length, begin)
-    return begin
 
 
 @njit(**INLINED)
@@ -163,44 +142,40 @@ def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
 
 
 @njit(**INNER)
-def add_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin):
-    """Twice the energy of linear springs from number `begin` on, k (l - l0)^2, at both ends of each.
+def add_energies(lanes, model, state):
+    """Twice the energy of linear springs without a tet, k (l - l0)^2, added to the second number of both ends' pairs.
 
-    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin
-    Out: pairs: the energies are added to the second numbers [J] (n_node, 2), lengths: of an organ alone [m]
-         (n_spring,)
+    Notes the lengths of an organ alone.
     """
-    for spring in range(
-        _add_groups_of_energies(lanes, position, pairs, lengths, nodes, stiffness, rest_length, begin), nodes.shape[0]
-    ):
+    position, _, _ = nodes_of(lanes, state)
+    pairs, lengths, nodes = state.node_pairs, state.spring_lengths, model.spring_nodes
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
+    first = model.tet_nodes.shape[0]
+    if len(lanes) == 0:
+        first = add_energy_groups(model, state)
+    for spring in range(first, nodes.shape[0]):
         edge = difference(lanes, position, nodes, spring, 1)
         twice = _measure(lanes, position, lengths, spring, stiffness, rest_length, edge)
         add_half(lanes, pairs, nodes[spring, 0], 1, twice)
         add_half(lanes, pairs, nodes[spring, 1], 1, twice)
 
 
-@njit(**INLINED)
-def _set_groups_of_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
-    """`set_node_law_groups` for an organ alone; returns the first remaining node and the results of `set_node_laws`."""
-    if len(lanes) == 0:
-        return set_node_law_groups(pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness)
-    return 0, False, False
-
-
 @njit(**INNER)
-def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness):
+def set_node_laws(lanes, model, state):
     """Tension of the averaged volumes and `node_law`, from the sums of volumes and energies around nodes.
 
-    One loop for both, as the root and the quotient of the law take longer than all else of a node.
+    Pairs hold the sums of six times the volumes [m^3] and of k (l - l0)^2 [J] before, tension [Pa] and half the factor
+    on springs after. One loop for both, as the root and the quotient of the law take longer than all else of a node.
 
-    In:  inverse_volume [1/m^3], bulk [Pa], softness [1/J], onset, growth, excess (n_node,) as in `OrganModel`
-    Out: pairs: sums of six times the volumes [m^3] and of k (l - l0)^2 [J] before, tension [Pa] and half the factor on
-         springs after (n_node, 2), steepness (n_node,)
     Returns True if any factor differs from 1, and True if any steepness is above STEEP_EXCESS.
     """
-    first, stiffens, steepens = _set_groups_of_node_laws(
-        lanes, pairs, inverse_volume, bulk, softness, onset, growth, excess, steepness
-    )
+    pairs, steepness, inverse_volume, bulk = (
+        state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
+    )  # fmt: skip
+    softness, onset, growth, excess = model.node_softness, model.node_onset, model.node_growth, model.node_excess
+    first, stiffens, steepens = 0, False, False
+    if len(lanes) == 0:
+        first, stiffens, steepens = set_node_law_groups(model, state)
     for node in range(first, steepness.shape[0]):
         six, energy = load_half(lanes, pairs, node, 0), load_half(lanes, pairs, node, 1)
         tension = node_tension(six, load_shared(lanes, pairs, inverse_volume, node), load_item(lanes, bulk, node))
@@ -222,14 +197,6 @@ def set_node_laws(lanes, pairs, inverse_volume, bulk, softness, onset, growth, e
 
 
 @njit(**INLINED)
-def _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, steep_count):
-    """`add_spring_groups` for an organ alone; returns the first remaining spring and the entries of `steep`."""
-    if len(lanes) == 0:
-        return add_spring_groups(position, force, nodes, stiffness, rest_length, begin, law, steep_count)
-    return begin, steep_count
-
-
-@njit(**INLINED)
 def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
     """Relax one arm towards the elastic tension over l0 of its spring [N/m]; returns its relief."""
     before = load_item(lanes, arm_tension, arm)
@@ -239,15 +206,17 @@ def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
 
 
 @njit(**INLINED)
-def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic, fade, moving):
+def fade_arms(lanes, model, state, spring, elastic, fade):
     """Relax the Maxwell arms of a spring towards its elastic tension: z_i <- z_i + fade_i (T_e - z_i).
 
     The arm's own tension is g_i (T_e - z_i); all tensions are over l0. At a constant strain z_i approaches T_e as
     1 - exp(-t / tau_i), and the energy stored in an arm never rises by its relaxation.
 
-    In:  arm_modulus g_i (3 * n_spring,), springs: n_spring, elastic T_e / l0 [N/m], fade: share for each arm, moving
-    Out: arm_tension z_i / l0 [N/m] (3 * n_spring,), relief: sum_i g_i z_i / l0 [N/m] (n_spring,)
+    In:  elastic T_e / l0 [N/m], fade: share for each arm
+    Out: spring_arm_tension z_i / l0, spring_relief
     """
+    arm_modulus, arm_tension, relief = model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief
+    moving, springs = state.moving, model.spring_nodes.shape[0]
     second, third = springs + spring, 2 * springs + spring
     total = load_shared(lanes, arm_tension, arm_modulus, spring) * _give_way(
         lanes, arm_tension, spring, elastic, fade[0], moving
@@ -262,55 +231,54 @@ def fade_arms(lanes, arm_modulus, arm_tension, relief, springs, spring, elastic,
 
 
 @njit(**INNER)
-def add_spring_forces(lanes, position, force, nodes, stiffness, rest_length, begin, law, moving):
-    """Springs from number `begin` on to the last: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their law.
+def add_spring_forces(lanes, model, state, law):
+    """Springs without a tet: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their `SpringLaw`.
 
-    In:  position [m] (n_node, 4), nodes (n_spring, 2), stiffness [N/m], rest_length [m] (n_spring,), begin, law:
-         `SpringLaw`, moving: 1 for a moving organ (1,)
-    Out: force, added to [N] (n_node, 4), law: arm_tension, relief, steep: first of each `group_width` springs with a
-         steep spring
-    Returns the number of entries in `law.steep`.
+    The arms relax, and `steep_springs` gets the first of each `group_width` springs with a steep spring. Returns the
+    number of its entries.
     """
-    measured, lengths, pairs = law.measured, law.lengths, law.pairs
-    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
-    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
-    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
-    first, steep_count = _add_groups_of_springs(lanes, position, force, nodes, stiffness, rest_length, begin, law, 0)
+    position, _, force = nodes_of(lanes, state)
+    nodes, stiffness, rest_length = model.spring_nodes, model.spring_stiffness, model.spring_rest_length
+    begin = model.tet_nodes.shape[0]
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
+    first, steep_count = begin, 0
+    if len(lanes) == 0:
+        first, steep_count = add_spring_groups(model, state, law)
     width = group_width(lanes)
     for spring in range(first, nodes.shape[0]):
         x, y, z = difference(lanes, position, nodes, spring, 1)
-        if measured:
+        if model.stiffens:
             length = _kept_length(lanes, lengths, spring, x, y, z)
         else:
             length = spring_length(x, y, z)
         share = load_shared(lanes, position, rest_length, spring) / length
         rigidity = load_item(lanes, stiffness, spring)
         scale = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             factor = _end_sum(lanes, pairs, nodes, spring)
             scale = scale * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 entry = begin + (spring - begin) // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry
                     steep_count += 1
-        if relaxes:
-            if fades:
-                fade_arms(
-                    lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], spring, scale / share, fade, moving
-                )
-            scale = scale * load_shared(lanes, position, gain, spring) - load_item(lanes, relief, spring) * share
+        if model.relaxes:
+            if law.fades:
+                fade_arms(lanes, model, state, spring, scale / share, law.fade)
+            gain, relief = (
+                load_shared(lanes, position, model.spring_gain, spring), load_item(lanes, state.spring_relief, spring)
+            )  # fmt: skip
+            scale = scale * gain - relief * share
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
     return steep_count
 
 
 @njit(**INNER)
-def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta):
-    """Rayleigh's beta along all springs: f = k beta dl/dt.
-
-    In:  position [m], velocity [m/s] (n_node, 4), nodes (n_spring, 2), stiffness [N/m] (n_spring,), beta [s]
-    Out: force, added to [N] (n_node, 4)
-    """
+def add_spring_damping(lanes, model, state):
+    """Rayleigh's beta along all springs: f = k beta dl/dt."""
+    position, velocity, force = nodes_of(lanes, state)
+    nodes, stiffness, beta = model.spring_nodes, model.spring_stiffness, model.beta
     for spring in range(nodes.shape[0]):
         x, y, z = difference(lanes, position, nodes, spring, 1)
         vx, vy, vz = difference(lanes, velocity, nodes, spring, 1)
@@ -318,26 +286,19 @@ def add_spring_damping(lanes, position, velocity, force, nodes, stiffness, beta)
         _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
 
 
-@njit(**INLINED)
-def _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
-    """`sum_tet_groups` for an organ alone; returns the first remaining tet."""
-    if len(lanes) == 0:
-        return sum_tet_groups(position, total, pairs, lengths, tets, stiffness, rest_length, stiffens)
-    return 0
-
-
 @njit(**INNER)
-def sum_at_nodes(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens):
-    """Sums of six times the volume of each tet at its corners, and of twice its spring's energy if springs stiffen.
+def sum_at_nodes(lanes, model, state):
+    """Sums of six times the volume of each tet [m^3] at its corners, in node_tension.
 
-    In:  position [m] (n_node, 4), tets (n_tet, 4), stiffness [N/m], rest_length [m] (n_spring,), stiffens
-    Out: total: volumes [m^3], added to (n_node,); if springs stiffen instead pairs: volumes [m^3] and energies [J],
-         added to (n_node, 2), and lengths as in `add_energies`
+    Where springs stiffen, in node_pairs with twice its spring's energy [J], as of `add_energies`.
     """
-    for tet in range(
-        _sum_groups_of_tets(lanes, position, total, pairs, lengths, tets, stiffness, rest_length, stiffens),
-        tets.shape[0],
-    ):
+    position, _, _ = nodes_of(lanes, state)
+    total, pairs, lengths, tets = state.node_tension, state.node_pairs, state.spring_lengths, model.tet_nodes
+    stiffness, rest_length, stiffens = model.spring_stiffness, model.spring_rest_length, model.stiffens
+    first = 0
+    if len(lanes) == 0:
+        first = sum_tet_groups(model, state)
+    for tet in range(first, tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         _, six = tet_shape(b, c, d)
         if stiffens:
@@ -361,12 +322,12 @@ def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
 
 
 @njit(**INNER)
-def add_volume_rates(lanes, position, velocity, total, pairs, tets, beta, stiffens):
-    """Beta's share of the averaged volume term: beta times the rates of volumes, added to the sums of `sum_at_nodes`.
-
-    In:  position [m], velocity [m/s] (n_node, 4), tets (n_tet, 4), beta [s], stiffens
-    Out: total or the first numbers of pairs [m^3], as in `sum_at_nodes`
-    """
+def add_volume_rates(lanes, model, state):
+    """Beta's share of the averaged volume term: beta times rates of volumes, added to the sums of `sum_at_nodes`."""
+    position, velocity, _ = nodes_of(lanes, state)
+    total, pairs, tets, beta, stiffens = (
+        state.node_tension, state.node_pairs, model.tet_nodes, model.beta, model.stiffens
+    )  # fmt: skip
     for tet in range(tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         six = beta * six_rates(b, c, d, *three_edges(lanes, velocity, tets, tet))
@@ -395,93 +356,76 @@ def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
     take_from_node(lanes, force, tets[tet, 0], x + gx, y + gy, z + gz)
 
 
-@njit(**INLINED)
-def _add_groups_of_tets(
-    lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
-    law, steep_count,
-):  # fmt: skip
-    """`add_tet_groups` for an organ alone; returns the first remaining tet, the entries of `squeezed` and `steep`."""
-    if len(lanes) == 0:
-        return add_tet_groups(
-            position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, squeezed,
-            law, steep_count,
-        )  # fmt: skip
-    return 0, 0, steep_count
-
-
 @njit(**INNER)
-def add_tet_forces(
-    lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low, moving,
-    squeezed, law, steep_count,
-):  # fmt: skip
+def add_tet_forces(lanes, model, state, law, steep_count):
     """Volume terms: the tension of a tet pulls its corners along dV/dx; with tet t comes spring t, its first edge.
 
     K (J - 1) per tet adds K to Lame's lambda and nothing to mu (after the volume-only energy of Golec et al. 2020); the
     mean tension of the volumes averaged at its corners is added.
 
-    In:  position [m] (n_node, 4), tension [Pa] (n_node,), tets (n_tet, 4), inverse_volume [1/m^3], bulk, averaged_bulk
-         [Pa] (n_tet,), stiffness [N/m], rest_length [m] (n_spring,), moving: 1 for a moving organ (1,), law:
-         `SpringLaw`, steep_count: entries of `law.steep` so far
-    Out: force, added to [N] (n_node, 4), low: smallest V / V0, the previous one included (1,), squeezed: first of each
-         `group_width` tets with a tet below SQUEEZED_RATIO (n_tet,), law: as in `add_spring_forces`
-    Returns the number of entries in `squeezed` and `law.steep`.
+    Keeps the smallest V / V0, and in `squeezed_tets` the first of each `group_width` tets with a tet below
+    SQUEEZED_RATIO; arms and `steep_springs` as in `add_spring_forces`, of which steep_count entries are there so far.
+    Returns the numbers of entries in `squeezed_tets` and `steep_springs`.
     """
-    measured, lengths, pairs = law.measured, law.lengths, law.pairs
-    stiffens, steepens, steep, steep_sum = law.stiffens, law.steepens, law.steep, law.steep_sum
-    relaxes, gain, relief, fades, fade = law.relaxes, law.gain, law.relief, law.fades, law.fade
-    arm_modulus, arm_tension = law.arm_modulus, law.arm_tension
-    first, count, steep_count = _add_groups_of_tets(
-        lanes, position, force, tension, tets, inverse_volume, bulk, averaged_bulk, stiffness, rest_length, low,
-        squeezed, law, steep_count,
-    )  # fmt: skip
+    position, _, force = nodes_of(lanes, state)
+    tension, tets = state.node_tension, model.tet_nodes
+    stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
+    low, squeezed = state.volume_ratio_smallest, state.squeezed_tets
+    pairs, lengths = state.node_pairs, state.spring_lengths
+    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
+    first, count = 0, 0
+    if len(lanes) == 0:
+        first, count, steep_count = add_tet_groups(model, state, law, steep_count)
     width = group_width(lanes)
     lowest = load_item(lanes, low, 0)
     for tet in range(first, tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         gradient, six = tet_shape(b, c, d)
-        ratio = volume_ratio(six, load_shared(lanes, position, inverse_volume, tet))
+        ratio = volume_ratio(six, load_shared(lanes, position, model.tet_inverse_volume, tet))
         lowest = keep_lower(ratio, lowest, ratio, lowest)
         if any_below(ratio, SQUEEZED_RATIO):
             entry = tet // width * width
             if count == 0 or squeezed[count - 1] != entry:
                 squeezed[count] = entry
                 count += 1
-        if measured:
+        if model.stiffens:
             averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
             length = _kept_length(lanes, lengths, tet, b[0], b[1], b[2])
         else:
             averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(b[0], b[1], b[2])
-        scale = tet_scale(ratio, load_item(lanes, bulk, tet), load_item(lanes, averaged_bulk, tet), averaged)
+        bulk, averaged_bulk = load_item(lanes, model.tet_bulk, tet), load_item(lanes, model.tet_averaged_bulk, tet)
+        scale = tet_scale(ratio, bulk, averaged_bulk, averaged)
         share = load_shared(lanes, position, rest_length, tet) / length
         rigidity = load_item(lanes, stiffness, tet)
         pull = spring_scale(share, rigidity)
-        if stiffens:
+        if law.stiffens:
             factor = _end_sum(lanes, pairs, tets, tet)
             pull = pull * factor
-            if steepens and any_below(factor * -1.0, -steep_sum):
+            if law.steepens and any_below(factor * -1.0, -steep_sum):
                 entry = tet // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry
                     steep_count += 1
-        if relaxes:
-            if fades:
-                fade_arms(lanes, arm_modulus, arm_tension, relief, stiffness.shape[0], tet, pull / share, fade, moving)
-            pull = pull * load_shared(lanes, position, gain, tet) - load_item(lanes, relief, tet) * share
+        if model.relaxes:
+            if law.fades:
+                fade_arms(lanes, model, state, tet, pull / share, law.fade)
+            gain, relief = (
+                load_shared(lanes, position, model.spring_gain, tet), load_item(lanes, state.spring_relief, tet)
+            )  # fmt: skip
+            pull = pull * gain - relief * share
         at_b = (
             scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
         )  # fmt: skip
         _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b)
-    store_item(lanes, low, 0, where_moving(lanes, moving, lowest, load_item(lanes, low, 0)))
+    store_item(lanes, low, 0, where_moving(lanes, state.moving, lowest, load_item(lanes, low, 0)))
     return count, steep_count
 
 
 @njit(**INNER)
-def add_volume_damping(lanes, position, velocity, force, tets, inverse_volume, bulk, beta):
-    """Beta's share of each tet's own volume term: tension K beta dJ/dt.
-
-    In:  position [m], velocity [m/s] (n_node, 4), tets (n_tet, 4), inverse_volume [1/m^3], bulk [Pa] (n_tet,), beta [s]
-    Out: force, added to [N] (n_node, 4)
-    """
+def add_volume_damping(lanes, model, state):
+    """Beta's share of each tet's own volume term: tension K beta dJ/dt."""
+    position, velocity, force = nodes_of(lanes, state)
+    tets, inverse_volume, bulk, beta = model.tet_nodes, model.tet_inverse_volume, model.tet_bulk, model.beta
     for tet in range(tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         six_rate = six_rates(b, c, d, *three_edges(lanes, velocity, tets, tet))

@@ -6,23 +6,22 @@ also differ in their rest shape, in what is anchored, and in how foundations hol
 of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.errors import OrganError
-from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
+from msdm_core.kernels.contact_kernels import QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
-    LANE_COLUMNS,
+    KEPT_NAMES,
     LANE_EMPTY,
-    LANE_NUMBERS,
-    LANE_ROWS,
-    LANE_SHARED,
-    SCRATCH_FIELDS,
+    MODEL_FIELDS,
+    STATE_FIELDS,
     ContactShapes,
+    Field,
     LaneModel,
     LaneState,
     OrganModel,
@@ -30,34 +29,20 @@ from msdm_core.kernels.structure_kernels import (
     ToolResponse,
 )
 from msdm_core.kernels.vector_kernels import aligned_zeros, lane_counts
-from msdm_core.organ.compile import blank_state
+from msdm_core.organ.state import field_sizes, state_sizes, zero_state
 from msdm_core.organ.stepping import unyielding
 
-# Of an organ's arrays, those that each lane has of its own; all others are shared.
-OWN_FIELDS = (
-    *("node_mass", "node_inverse_mass", "spring_stiffness", "tet_bulk", "tet_averaged_bulk", "node_bulk"),
-    "node_softness",
-)
-OWN_NUMBERS = ("averages_volume", "stable_step")
-# Fields that follow from the rest shape, shared or each lane's own, those of foundations with the lane as first index;
-# and rows of surface, supports and anchored nodes, which depend on the anchors too and of which lanes may have
-# different numbers.
-REST_FIELDS = ("spring_rest_length", "tet_inverse_volume", "node_inverse_volume", "motion_node_shift")
-HELD_FIELDS = ("foundation_position", "foundation_stiffness", "motion_foundation_shift")
-ROW_FIELDS = ("surface_triangles", "surface_rest_area", "support_nodes", "support_area", "motion_anchored_nodes")
+SHARED = tuple(field.name for field in MODEL_FIELDS if field.lanes == "shared")
+# Fields that follow from the rest shape, shared or each lane's own.
+REST = tuple(field.name for way in ("rest", "rows", "first") for field in MODEL_FIELDS if field.lanes == way)
+# Fields of a state that lanes are filled with: scratch in rows too, as no kernel writes where nothing moves the ground.
+PART_FIELDS = tuple(field for field in STATE_FIELDS if field.name in KEPT_NAMES or field.lanes == "rows")
 # The number of rows that a lane has, and a field with that many.
 COUNTS = {
     "surface_count": "surface_triangles",
     "support_count": "support_nodes",
     "anchor_count": "motion_anchored_nodes",
 }
-ALWAYS_SHARED = tuple(
-    name
-    for name in LaneModel._fields
-    if name
-    not in (*OWN_FIELDS, *OWN_NUMBERS, *REST_FIELDS, *HELD_FIELDS, *ROW_FIELDS, *COUNTS, "node_rest_position", "lanes")
-)
-SHARED_REST = (*REST_FIELDS, *HELD_FIELDS, *ROW_FIELDS, "node_rest_position")
 
 
 def stack_organs(
@@ -81,19 +66,17 @@ def stack_organs(
             f"{len(organs)} organs for the {count} lanes of {np.dtype(dtype)}: stack them in several groups"
         )
     first = organs[0]
-    own = {name: aligned_zeros((len(getattr(first, name)), count), dtype) for name in OWN_FIELDS}
-    numbers = {"averages_volume": np.zeros(count, dtype=np.bool_), "stable_step": np.zeros(count)}
-    shared = {name: getattr(first, name) for name in (*ALWAYS_SHARED, "node_rest_position")}
-    if own_rest:
-        rest = {name: aligned_zeros((*getattr(first, name).shape, count), dtype) for name in REST_FIELDS}
-        rest |= {name: np.zeros((count, *getattr(first, name).shape)) for name in HELD_FIELDS}
-        for name, room in surface_rooms(first).items():
-            rows = getattr(first, name)
-            rest[name] = np.zeros((count, room, *rows.shape[1:]), dtype=rows.dtype)
-    else:
-        rest = {name: getattr(first, name) for name in (*REST_FIELDS, *HELD_FIELDS, *ROW_FIELDS)}
-    counts = {name: np.zeros(count, dtype=np.int32) for name in COUNTS}
-    model = LaneModel(lanes=(0,) * count, **own, **numbers, **rest, **counts, **shared)
+    sizes = field_sizes(MODEL_FIELDS, first) | (surface_rooms(first) if own_rest else {})
+    shared = ("shared", "first") if own_rest else ("shared", "first", "rest", "rows")
+    model = LaneModel(
+        lanes=(0,) * count,
+        **{
+            field.name: getattr(first, field.name) if field.lanes in shared else _lane_zeros(field, sizes, count, dtype)
+            for field in MODEL_FIELDS
+            if field.lanes != "alone"
+        },
+        **{name: np.zeros(count, dtype=np.int32) for name in COUNTS},
+    )
     for lane in range(count):
         organ = organs[min(lane, len(organs) - 1)]
         _check_shared(model, lane, organ, first.node_inverse_mass == 0.0)
@@ -101,14 +84,29 @@ def stack_organs(
     return model
 
 
-def surface_rooms(organ: OrganModel) -> dict[str, int]:
-    """The most rows that an organ of these tets can have in each of ROW_FIELDS, for any anchors."""
+def _lane_zeros(field: Field, sizes: Mapping[int | str, int], lanes: int, dtype: Any) -> NDArray[Any]:
+    """The array of a field in so many lanes, in its layout."""
+    lengths = field.lengths(sizes)
+    match field.lanes:
+        case "own" | "rest":
+            return aligned_zeros((*lengths, lanes), dtype if lengths else field.dtype)
+        case "halves":
+            return aligned_zeros((*lengths[::-1], lanes), dtype)
+        case "rows" | "turns":
+            return aligned_zeros((lanes, *lengths) if lengths != (1,) else (lanes,), field.dtype)
+    return aligned_zeros(lengths, field.dtype)
+
+
+def surface_rooms(organ: OrganModel) -> dict[int | str, int]:
+    """The most rows that an organ of these tets can have for any anchors, by name."""
     faces = np.sort(organ.tet_nodes[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
     outer, times = np.unique(faces, axis=0, return_counts=True)
     outer = outer[times == 1]
-    nodes = len(np.unique(outer)) if len(organ.support_kind) else 0
-    anchors = len(organ.node_mass) if len(organ.motion_node_shift) else 0
-    return dict(zip(ROW_FIELDS, (len(outer), len(outer), nodes, nodes, anchors), strict=True))
+    return {
+        "n_surface": len(outer),
+        "n_support_node": len(np.unique(outer)) if len(organ.support_kind) else 0,
+        "n_anchored": len(organ.node_mass) if len(organ.motion_node_shift) else 0,
+    }
 
 
 def has_own_rest(model: LaneModel) -> bool:
@@ -118,7 +116,7 @@ def has_own_rest(model: LaneModel) -> bool:
 
 def same_rest(one: OrganModel, other: OrganModel) -> bool:
     """Whether two organs have the same rest shape and anchors, so that they can share them as lanes."""
-    same = all(_equal(getattr(one, name), getattr(other, name)) for name in SHARED_REST)
+    same = all(_equal(getattr(one, name), getattr(other, name)) for name in REST)
     return same and np.array_equal(one.node_inverse_mass == 0.0, other.node_inverse_mass == 0.0)
 
 
@@ -146,7 +144,7 @@ def set_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
 
 def _check_shared(model: LaneModel, lane: int, organ: OrganModel, anchored: NDArray[np.bool_]) -> None:
     own = has_own_rest(model)
-    differing = _differing(model, organ, ALWAYS_SHARED if own else (*ALWAYS_SHARED, *SHARED_REST), anchored)
+    differing = _differing(model, organ, SHARED if own else (*SHARED, *REST), anchored)
     if differing:
         shared = "tets" if own else "mesh, anchors"
         way = "a group of its own" if own else "a group of its own, or stack them with own_rest"
@@ -170,14 +168,13 @@ def _equal(a: Any, b: Any) -> bool:
 
 def _write_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
     # Writable for this moment only: a kernel that writes to the model does not compile.
-    own = has_own_rest(model)
-    for name in (*OWN_FIELDS, *OWN_NUMBERS, *(REST_FIELDS if own else ())):
-        _write(getattr(model, name), (..., lane), getattr(organ, name))
-    for name in HELD_FIELDS if own else ():
-        _write(getattr(model, name), lane, getattr(organ, name))
-    for name in ROW_FIELDS if own else ():
-        rows = getattr(organ, name)
-        _write(getattr(model, name), (lane, slice(len(rows))), rows)
+    own_rest = has_own_rest(model)
+    for field in MODEL_FIELDS:
+        values = getattr(organ, field.name)
+        if field.lanes == "own" or (own_rest and field.lanes == "rest"):
+            _write(getattr(model, field.name), (..., lane), values)
+        elif own_rest and field.lanes == "rows":
+            _write(getattr(model, field.name), (lane, slice(len(values))), values)
     for name, rows in COUNTS.items():
         _write(getattr(model, name), lane, len(getattr(organ, rows)))
 
@@ -198,26 +195,19 @@ def lanes_of(
 ) -> LaneState:
     """Lanes that start from the states of organs, of which `first` is the first; lanes beyond them are empty."""
     count = lane_count(dtype, lanes)
-    if own_rest:
-        rooms = surface_rooms(first)
-        first = first._replace(
-            surface_triangles=np.zeros((rooms["surface_triangles"], 3), dtype=np.int32),
-            support_nodes=np.zeros(rooms["support_nodes"], dtype=np.int32),
-        )
-    blank = blank_state(first, shape_count=len(states[0].contact_engaged))
+    sizes = field_sizes(MODEL_FIELDS, first) | (surface_rooms(first) if own_rest else {})
+    sizes = state_sizes(sizes, shape_count=len(states[0].contact_engaged))
     # Steep springs are held in all lanes at once, between what makes these rows in each lane and what reads them.
-    rooms_of_rows = count if first.stiffens else 1
+    turns = count if first.stiffens else 1
     state = LaneState(
-        **{name: aligned_zeros((*getattr(blank, name).shape, count), dtype) for name in LANE_COLUMNS},
-        **{name: np.stack([getattr(blank, name)] * count) for name in LANE_ROWS},
-        **{name: np.repeat(getattr(blank, name), count) for name in LANE_NUMBERS},
-        **{name: getattr(blank, name) for name in LANE_SHARED},
-        node_pairs=aligned_zeros((2, len(first.node_softness), count), dtype),
-        contact_rows=np.stack([blank.contact_rows] * rooms_of_rows),
-        contact_places=np.stack([blank.contact_places] * rooms_of_rows),
-        kept_force=aligned_zeros((*blank.node_force.shape, count), dtype),
-        surface_count=np.full(count, len(first.surface_triangles), dtype=np.int32),
-        support_count=np.full(count, len(first.support_nodes), dtype=np.int32),
+        **{
+            field.name: _lane_zeros(field, sizes, turns if field.lanes == "turns" else count, dtype)
+            for field in STATE_FIELDS
+            if field.lanes != "alone"
+        },
+        kept_force=aligned_zeros((*states[0].node_force.shape, count), dtype),
+        surface_count=np.zeros(count, dtype=np.int32),
+        support_count=np.zeros(count, dtype=np.int32),
     )
     for lane in range(count):
         put_lane(state, lane, states[min(lane, len(states) - 1)])
@@ -225,17 +215,27 @@ def lanes_of(
     return state
 
 
+def _lane_part(field: Field, state: LaneState, lane: int) -> NDArray[Any]:
+    """The part of a field's array that a lane uses, in place, as of an organ alone."""
+    array = getattr(state, field.name)
+    match field.lanes:
+        case "own":
+            return array[..., lane]
+        case "halves":
+            return array[..., lane].T
+        case "rows":
+            return array[lane] if array.ndim > 1 else array[lane : lane + 1]
+        case "turns":
+            return array[0]
+    return array
+
+
 def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
     """Let a lane go on from an organ's state, its fault forgotten; `rest_state(...)` restarts it."""
-    for name in LANE_COLUMNS:
-        if name not in SCRATCH_FIELDS:
-            getattr(state, name)[..., lane] = getattr(organ, name)
-    for name in LANE_ROWS:
-        # Where nothing moves the ground, no kernel writes where foundations hold nodes.
-        if name not in SCRATCH_FIELDS or name == "ground_foundation":
-            values = getattr(organ, name)
-            # Lanes with rest shapes of their own have room for the organ with the largest surface.
-            getattr(state, name)[lane][tuple(slice(length) for length in values.shape)] = values
+    for field in PART_FIELDS:
+        values = getattr(organ, field.name)
+        # Lanes with rest shapes of their own have room for the organ with the largest surface.
+        _lane_part(field, state, lane)[tuple(map(slice, values.shape))] = values
     state.surface_count[lane] = organ.contact_engaged.shape[1] // QUADRATURE_COUNT
     state.support_count[lane] = len(organ.support_stretch)
     state.lane_fault[lane] = FAULT_NONE
@@ -243,27 +243,15 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
 
 def get_lane(state: LaneState, lane: int) -> OrganState:
     """A copy of one lane's state as that of an organ alone, in float64: to measure, to save, to describe a fault."""
-    nodes, surface, supports = len(state.node_position), state.surface_count[lane], state.support_count[lane]
-    points = surface * QUADRATURE_COUNT
-    columns = {name: getattr(state, name)[..., lane] for name in LANE_COLUMNS}
-    rows = {name: getattr(state, name)[lane] for name in LANE_ROWS}
-    for name, length in (("contact_engaged", points), ("contact_stretch", points), ("contact_candidates", surface)):
-        rows[name] = rows[name][:, :length]
-    rows["support_stretch"] = rows["support_stretch"][:supports]
-    row_count = len(rows["contact_engaged"]) * points
-    return OrganState(
-        **{
-            name: np.zeros(values.shape) if name in SCRATCH_FIELDS else np.array(values, dtype=np.float64, order="C")
-            for name, values in columns.items()
-        },
-        **{name: values.copy() for name, values in rows.items()},
-        **{name: getattr(state, name)[lane : lane + 1].copy() for name in LANE_NUMBERS},
-        **{name: np.zeros_like(getattr(state, name)) for name in LANE_SHARED},
-        **{name: aligned_zeros((nodes, 4)) for name in ("row_position", "row_velocity", "row_force")},
-        node_pairs=aligned_zeros((len(state.node_steepness), 2)),
-        contact_rows=np.zeros((row_count, ROW_WIDTH)),
-        contact_places=np.zeros((row_count, PLACE_WIDTH), dtype=np.int32),
-    )
+    parts = {field: _lane_part(field, state, lane) for field in STATE_FIELDS if field.lanes != "alone"}
+    sizes = field_sizes(parts, parts.values())
+    surface, points = state.surface_count[lane], QUADRATURE_COUNT * state.surface_count[lane]
+    sizes |= {"n_surface": surface, "n_point": points, "n_row": points * sizes["n_shape"]}
+    organ = zero_state(sizes | {"n_support_node": state.support_count[lane]})
+    for field in PART_FIELDS:
+        values = getattr(organ, field.name)
+        values[...] = parts[field][tuple(map(slice, values.shape))]
+    return organ
 
 
 def stack_shapes(shapes: Sequence[ContactShapes], lanes: int = 8) -> ContactShapes:

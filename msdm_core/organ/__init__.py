@@ -1,6 +1,6 @@
 """Organs: compilation, supports and foundations, stable step, integration, measured quantities."""
 
-from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, rest_state
+from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import (
     contact_energy,
     kinetic_energy,
@@ -11,6 +11,7 @@ from msdm_core.organ.measure import (
 )
 from msdm_core.organ.motion import SIGNAL
 from msdm_core.organ.stability import contact_node_area, stable_dt
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import (
     NO_CONTACT,
     NO_SHAPES,

@@ -15,13 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels.contact_kernels import PLACE_WIDTH, QUADRATURE_COUNT, ROW_WIDTH
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
-from msdm_core.kernels.squeeze_kernels import STEEP_WIDTH
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
-from msdm_core.kernels.vector_kernels import aligned_zeros
 from msdm_core.material.lumping import MassScheme, lump_mass
 from msdm_core.material.regions import (
     Capsule,
@@ -43,6 +40,7 @@ from msdm_core.organ.foundation import Foundation, foundation_fields
 from msdm_core.organ.measure import spring_tensions
 from msdm_core.organ.motion import Motion, motion_fields
 from msdm_core.organ.stability import own_step, steep_sweeps
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
 
@@ -163,51 +161,6 @@ def rest_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
     if np.any(model.gravity != 0.0):
         _settle(model, state)
     return state
-
-
-def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
-    """The undeformed organ at rest, without contact, with contact memory for `shape_count` shapes."""
-    point_count = len(model.surface_triangles) * QUADRATURE_COUNT
-    steep_count = len(model.spring_nodes) if model.stiffens else 0
-    return OrganState(
-        node_position=model.node_rest_position.copy(),
-        node_velocity=np.zeros_like(model.node_rest_position),
-        node_force=np.zeros_like(model.node_rest_position),
-        node_tension=np.zeros_like(model.node_mass),
-        row_position=aligned_zeros((len(model.node_mass), 4)),
-        row_velocity=aligned_zeros((len(model.node_mass), 4)),
-        row_force=aligned_zeros((len(model.node_mass), 4)),
-        squeezed_tets=np.zeros(len(model.tet_nodes), dtype=np.int32),
-        node_pairs=aligned_zeros((len(model.node_softness), 2)),
-        node_steepness=np.zeros_like(model.node_softness),
-        spring_lengths=np.zeros(steep_count),
-        steep_springs=np.zeros(steep_count, dtype=np.int32),
-        steep_places=np.zeros(steep_count, dtype=np.int32),
-        steep_rows=aligned_zeros((steep_count, STEEP_WIDTH)),
-        steep_speed=aligned_zeros((len(model.node_softness), 3)),
-        spring_arm_tension=np.zeros_like(model.spring_arm_modulus),
-        spring_relief=np.zeros_like(model.spring_gain),
-        contact_engaged=np.zeros((shape_count, point_count), dtype=np.uint8),
-        contact_stretch=np.zeros((shape_count, point_count, 3)),
-        contact_candidates=np.zeros((shape_count, len(model.surface_triangles)), dtype=np.int32),
-        contact_rows=np.zeros((shape_count * point_count, ROW_WIDTH)),
-        contact_places=np.zeros((shape_count * point_count, PLACE_WIDTH), dtype=np.int32),
-        contact_hold=np.zeros_like(model.node_mass),
-        contact_passed=np.zeros(2, dtype=np.int32),
-        support_stretch=np.zeros((len(model.support_nodes), len(model.support_kind), 3)),
-        motion=np.zeros((len(model.motion_node_shift), 4)),
-        ground_foundation=model.foundation_position.copy(),
-        ground_support=np.stack([model.support_position, np.zeros_like(model.support_position)], axis=1),
-        ground_load=np.zeros_like(model.support_position),
-        ground_rate=np.zeros(len(model.motion_node_shift)),
-        volume_ratio_smallest=np.ones(1),
-        lane_fault=np.zeros(1, dtype=np.int32),
-        moving=np.ones(1),
-        finite_sum=np.zeros(1),
-        candidate_count=np.zeros(1, dtype=np.int32),
-        contact_kept=np.ones(1, dtype=np.uint8),
-        contact_count=np.zeros(1, dtype=np.int32),
-    )
 
 
 def _settle(model: OrganModel, state: OrganState) -> None:

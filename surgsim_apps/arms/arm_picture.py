@@ -1,5 +1,6 @@
 """A picture of one arm with its meshes, its shaft in a trocar."""
 
+import math
 from itertools import product
 from typing import Any
 
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.instruments import Arm
-from surgsim_env.rendering import DrawnCapsule, draw_still, filling, shown_geoms
+from surgsim_env.rendering import Camera, DrawnCapsule, draw_still, shown_geoms
 
 SIZE, FIELD_OF_VIEW = (1600, 1200), 30.0
 # Share of the picture that the arm fills.
@@ -36,9 +37,26 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     length = float(np.linalg.norm(aside))
     aside = aside / length if length > 1e-6 else arm.port.rotation[:, 1]
     direction: Any = aside + AHEAD * np.cross(aside, up) + ABOVE * up
-    camera = filling(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
+    camera = filling_camera(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
     ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
     return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]
+
+
+def filling_camera(
+    points: FloatArray, direction: FloatArray, up: FloatArray, fov: float, aspect: float, share: float
+) -> Camera:
+    """Nearest camera in a direction with all points [m] (n, 3) in the middle share of its picture.
+
+    With x a point's place across the view, z towards the camera, c and d the camera's, and t the share times the
+    tangent of half the angle of view, |x - c| <= t (d - z) for all points where t d is at least max(x + t z) - c and
+    max(t z - x) + c.
+    """
+    rotation = Camera.looking(direction, np.zeros(3), up, fov).rotation
+    seen = points @ rotation
+    room = share * math.tan(math.radians(0.5 * fov)) * np.array([aspect, 1.0])
+    high, low = ((sign * seen[:, :2] + room * seen[:, 2:]).max(axis=0) for sign in (1.0, -1.0))
+    position = rotation @ np.append(0.5 * (high - low), (0.5 * (high + low) / room).max())
+    return Camera.looking(position, position - rotation[:, 2], up, fov)
 
 
 def _box_corners(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:

@@ -1,7 +1,7 @@
-"""Exact distances of capsules, and clearance of arms from organ, body wall and each other, many at once.
+"""Exact distances of capsules, and clearance of arms from organ, body wall and each other, as arrays.
 
-A capsule is a segment with a radius: its clearance from anything is the distance of the segment less the radii. Where
-segments meet, the distance is 0 and the clearance is minus the radii: the depth of an overlap is not computed.
+A capsule is a segment with a radius: its clearance from anything is the distance of the segment less the radii. Of
+segments that meet, the distance is 0 and the clearance is minus the radii: the depth of an overlap is not computed.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.arms.kinematics import BatchKinematics, Chain, cross, dot
 from surgsim_apps.arms.ports import Ports
 
-# Triangles of one cluster; pairs of segment and triangle that are computed at once.
+# Triangles of one cluster; pairs of segment and triangle in one batch.
 CLUSTER_SIZE = 24
 PAIRS_AT_ONCE = 400_000
 # Parts of an arm this near to the tip (and its ball) may touch the organ [m].
 TIP_ZONE = 0.005
-# Parts of two arms this near to a common point are left out of their distance [m]: the tips meet there.
+# Parts of two arms this near to a common point are left out of their distance [m]: their tips meet.
 MEETING_ZONE = 0.020
 
 
@@ -53,7 +53,7 @@ def point_segment_distance(point: FloatArray, segment: FloatArray) -> FloatArray
 
 
 def segment_triangle_distance(segment: FloatArray, corners: FloatArray) -> FloatArray:
-    """Distances of segments (n, 2, 3) from triangles (n, 3, 3) [m], (n,); 0 where they cross."""
+    """Distances of segments (n, 2, 3) from triangles (n, 3, 3) [m], (n,); 0 if they cross."""
     edges = corners[:, [[0, 1], [1, 2], [2, 0]]]
     least = segment_distance(segment[:, None], edges).min(axis=1)
     normal = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -70,21 +70,21 @@ def segment_triangle_distance(segment: FloatArray, corners: FloatArray) -> Float
 
 
 def _within(point: FloatArray, corners: FloatArray, normal: FloatArray) -> NDArray[np.bool_]:
-    """Whether points of the triangles' planes (n, 3) lie in the triangles (n, 3, 3)."""
+    """Mask of points of the triangles' planes (n, 3) inside the triangles (n, 3, 3)."""
     inside = np.ones(len(point), dtype=bool)
-    for one, two in ((0, 1), (1, 2), (2, 0)):
-        inside &= dot(cross(corners[:, two] - corners[:, one], point - corners[:, one]), normal) >= 0.0
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        inside &= dot(cross(corners[:, end] - corners[:, start], point - corners[:, start]), normal) >= 0.0
     return inside
 
 
 class ClusteredSurface:
-    """A triangle surface for distances: its triangles in clusters, most of which their bounding balls rule out."""
+    """A triangle surface for distances, in clusters with bounding balls for early rejection."""
 
     def __init__(self, points: FloatArray, triangles: IntArray) -> None:
         """Take a surface's points (n, 3) [m] and triangles (m, 3)."""
         corners = points[triangles]
         order = _clustered(corners.mean(axis=1), np.arange(len(corners)))
-        self._first = np.cumsum([0, *(len(one) for one in order)])
+        self._first = np.cumsum([0, *(len(cluster) for cluster in order)])
         self.corners = corners[np.concatenate(order)]
         self._centre, self._radius = _balls(self.corners[:, None])
         self._middle, self._extent = (part[0] for part in _balls(self.corners.reshape(1, 1, -1, 3)))
@@ -94,7 +94,7 @@ class ClusteredSurface:
         self._cluster_radius = np.concatenate([radius for _, radius in balls])
 
     def distance(self, segments: FloatArray, cap: float = np.inf) -> FloatArray:
-        """Distances of segments (n, 2, 3) from the surface [m], (n,); cap where they are at least that.
+        """Distances of segments (n, 2, 3) from the surface [m], at most `cap`, (n,).
 
         A small cap is quick: triangles that are certainly further away are skipped.
         """
@@ -125,8 +125,8 @@ class ClusteredSurface:
         pair_row, triangle = pair_row[kept], triangle[kept]
         for low in range(0, len(pair_row), PAIRS_AT_ONCE):
             part = slice(low, low + PAIRS_AT_ONCE)
-            found = segment_triangle_distance(segments[pair_row[part]], self.corners[triangle[part]])
-            np.minimum.at(result, pair_row[part], found)
+            distance = segment_triangle_distance(segments[pair_row[part]], self.corners[triangle[part]])
+            np.minimum.at(result, pair_row[part], distance)
         return result
 
 
@@ -149,10 +149,10 @@ def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The parts of segments (..., 2, 3) outside balls about centres (..., 3) [m]: two each, and which of them are any.
+    """Parts of segments (..., 2, 3) outside balls about centres (..., 3) [m].
 
     Returns:
-        parts (..., 2, 2, 3), before and after the ball, and whether each has anything left (..., 2).
+        parts (..., 2, 2, 3), before and after the ball, and a mask of the non-empty ones (..., 2).
     """
     start, span = segments[..., 0, :], segments[..., 1, :] - segments[..., 0, :]
     offset = start - centre
@@ -174,7 +174,7 @@ def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tup
 
 @dataclass(frozen=True)
 class Obstacles:
-    """Obstacles of an arm: organ at rest and body wall; `ball` is the radius of its tip [m], which may touch."""
+    """Obstacles of an arm: organ at rest and body wall; the tip, of radius `ball` [m], may touch."""
 
     organ: ClusteredSurface
     ports: Ports
@@ -201,10 +201,10 @@ class Obstacles:
 
 
 def wall_clearance(ports: Ports, segments: FloatArray, trocar: FloatArray) -> FloatArray:
-    """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf where all lies in the hole.
+    """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf inside the hole.
 
-    With heights from h0 to h1 above the wall's middle surface and a thickness t:
-    max(h0 - t/2, -t/2 - h1): how far a segment is, or would have to be moved to be, clear of it.
+    With heights from h0 to h1 above the wall's middle surface and a thickness t: max(h0 - t/2, -t/2 - h1), the gap, or
+    minus the shortest move out of the wall.
     """
     wall, half = ports.wall, 0.5 * ports.wall.thickness
     parts, left = outside_ball(segments, trocar, wall.hole)
@@ -220,7 +220,7 @@ def wall_clearance(ports: Ports, segments: FloatArray, trocar: FloatArray) -> Fl
 
 
 def split_at_trocar(kinematics: BatchKinematics, chain: Chain) -> tuple[FloatArray, FloatArray]:
-    """Shapes inside and outside the body, each (n, n_shape, 2, 3) [m]; NaN where a shape has no part there.
+    """Shapes inside and outside the body, each (n, n_shape, 2, 3) [m]; NaN for a shape without such a part.
 
     The shaft and the bodies beyond it are cut by the plane through the trocar across the shaft; all others are outside.
     """
@@ -249,8 +249,8 @@ def arm_distances(
     Each arm's own trocar divides its shapes into inside and outside; parts within MEETING_ZONE of the
     point are left out.
     """
-    pieces = [split_at_trocar(*one) for one in (first, second)]
-    radii = [one[0].arm.shape_radius for one in (first, second)]
+    pieces = [split_at_trocar(*first), split_at_trocar(*second)]
+    radii = [first[0].arm.shape_radius, second[0].arm.shape_radius]
     inside = []
     for segments, _ in pieces:
         parts, left = outside_ball(segments, points[:, None], MEETING_ZONE)
@@ -261,7 +261,7 @@ def arm_distances(
 
 
 def _least(segments: list[FloatArray], radii: list[FloatArray]) -> FloatArray:
-    """Smallest clearance of two sets of capsules (n, k, 2, 3), (n, l, 2, 3) [m], (n,); inf where one set is empty."""
+    """Smallest clearance of two sets of capsules (n, k, 2, 3), (n, l, 2, 3) [m], (n,); inf for an empty set."""
     with np.errstate(invalid="ignore"):
         gaps = segment_distance(segments[0][:, :, None], segments[1][:, None]) - radii[0][:, None] - radii[1]
     return np.where(np.isnan(gaps), np.inf, gaps).min(axis=(1, 2))

@@ -1,7 +1,7 @@
-"""A palpating arm made from a model file alone: chain, tip, shaft, trocar, servos and a home within reach.
+"""A palpating arm from a model file alone: chain, tip, shaft, trocar, servos and a home within reach.
 
-The arm's own frame is that of its model file. An arm with a remote centre has its trocar there; for any other one a
-trocar is chosen together with home, or given and a home searched whose shaft passes through it.
+The arm's own frame is the model file's. An arm with a remote centre has its trocar there; for any other arm a trocar is
+chosen together with home, or home is searched for a given trocar.
 """
 
 import math
@@ -33,19 +33,19 @@ from surgsim_env.scene import AddedShape, ArmDescription, JointControl, Port, Ti
 SHAFT_RADIUS, NECK_RADIUS, NECK_LENGTH, BALL_RADIUS = 0.004, 0.003, 0.024, 0.005
 # Length of a palpator that is mounted on an arm without a straight shaft [m].
 TOOL_LENGTH = 0.40
-# At home the tip is this far past the trocar [m].
+# Depth of the tip past the trocar at home [m].
 HOME_DEPTH = 0.10
-# Servos: the natural frequency of each joint [rad/s] and its smallest stiffness at the tip [N/m], where 5 N move it by
-# 0.1 mm. Chosen.
+# Servos, chosen: natural frequency of each joint [rad/s] and its smallest stiffness at the tip [N/m]: 5 N move it by
+# 0.1 mm.
 NATURAL_FREQUENCY, TIP_STIFFNESS = 2.0 * math.pi * 30.0, 5e4
 # A joint's smallest lever to the tip for that stiffness [m], and the force at the tip that its servo can exert [N].
 LEVER_LEAST, TIP_FORCE = 0.02, 50.0
-# Speed limits where the model states none [rad/s], [m/s]; range of joints without limits [rad], [m].
+# Speed limits for a model without them [rad/s], [m/s]; range of joints without limits [rad], [m].
 TURN_SPEED, SLIDE_SPEED = 2.0, 0.4
 TURN_RANGE, SLIDE_RANGE = 2.0 * math.pi, 0.5
-# Places that a home is judged by: depths past the trocar [m], straight on and tilted by an angle [rad] to four sides.
+# Places for judging a home: depths past the trocar [m], straight on and tilted by an angle [rad] to four sides.
 DEPTHS, TILT = (0.06, 0.10, 0.14), math.radians(25.0)
-# Poses drawn at random, and how many of the best are tried.
+# Poses drawn at random, and number of the best to be tried.
 POSES_DRAWN, POSES_TRIED = 3000, 20
 # Tolerances of the trocar [m]: with a remote centre the file's rounding, else what control keeps at home.
 FIXED_TOLERANCE, KEPT_TOLERANCE = 1e-4, 1e-5
@@ -60,10 +60,10 @@ class FoundArm:
     """An arm found in a model file.
 
     Fields:
-        description: of the arm, for a folder that contains its TOML file
-        found: what was found, a sentence each
-        chosen: what the file lacks and was chosen, a sentence each
-        reach: share of the places around home (DEPTHS, TILT) that the tip reaches
+        description: of the arm, for a folder with its TOML file
+        found: findings, a sentence each
+        chosen: choices for things missing in the file, a sentence each
+        reach: share of the places around home (DEPTHS, TILT) in reach of the tip
     """
 
     description: ArmDescription
@@ -79,7 +79,7 @@ class _Tool:
     Fields:
         tip_body, tip_offset, tip_direction: the tip [m] and the direction out of it   (3,)
         shaft_body, shaft_point, shaft_axis: a point of the shaft's axis [m] and its direction to the tip   (3,)
-        shapes: capsules and a ball that tissue feels
+        shapes: capsules and a ball in contact with tissue
         contact: names of these or of the model's own
         ball: the ball's name
     """
@@ -106,12 +106,12 @@ def find_arm(
 
     Args:
         path: of the file.
-        tip: link or site of the tip, or to which a tool is mounted; by default the end of the longest chain of joints.
+        tip: link or site of the tip, or carrier of a mounted tool; by default the end of the longest chain of joints.
         trocar: point of the trocar in the model's own frame [m]; by default the remote centre, or chosen with home.
         tool_length: mount a straight palpator of this length [m], even if the model has a shaft.
 
     Raises:
-        ValueError: a file that cannot be read, a tip that is not there, a trocar that no pose reaches.
+        ValueError: an unreadable file, an unknown tip, a trocar out of reach.
     """
     return _Finder(ModelSurvey(path), tip, trocar, tool_length).found
 
@@ -144,7 +144,7 @@ class _Finder:
         home, point, into, reach = self._search_home(arm)
         self.found = self._finish(link_shapes, home, point, into, reach)
 
-    # ---- what is in the file ---------------------------------------------------------------------------------
+    # ---- findings in the file --------------------------------------------------------------------------------
 
     def _limits(self) -> list[tuple[float, float]]:
         limits = []
@@ -172,7 +172,7 @@ class _Finder:
         if survey.inertias:
             self.chosen.append(
                 "links without a valid inertia get that of a block around their shapes: "
-                f"{_listed([one.link for one in survey.inertias])}"
+                f"{_listed([inertia.link for inertia in survey.inertias])}"
             )
 
     # ---- shaft and tip ---------------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ class _Finder:
         near = self._world(body, offset) if offset is not None else self.survey.data.xpos[body]
         if body == carrier and offset is None:
             near = max(ends, key=lambda end: float(norm(end - self.survey.data.xpos[body])))
-        start, end = sorted(ends, key=lambda one: -float(norm(one - near)))
+        start, end = sorted(ends, key=lambda point: -float(norm(point - near)))
         along = (end - start) / norm(end - start)
         name = self.survey.body_name(carrier)
         self.notes.append(
@@ -256,9 +256,9 @@ class _Finder:
             names = ["neck"] if not anchors else [*(f"wrist_{n}" for n in range(1, len(anchors))), "neck"]
             carriers = [shaft_body] if not anchors else bodies[1:]
             parts = [("shaft", shaft_body, end - (length - neck) * along, end, SHAFT_RADIUS)]
-            for name, carrier, one, other in zip(names, carriers, corners, corners[1:], strict=False):
-                if norm(other - one) >= ONE_MM:
-                    parts.append((name, carrier, one, other, NECK_RADIUS))
+            for name, carrier, near, far in zip(names, carriers, corners, corners[1:], strict=False):
+                if norm(far - near) >= ONE_MM:
+                    parts.append((name, carrier, near, far, NECK_RADIUS))
             shapes = tuple(self._shape(*part) for part in parts)
             shapes = (AddedShape("tip_ball", survey.body_name(body), vector(offset), BALL_RADIUS), *shapes)
             contact = tuple(shape.name for shape in shapes)
@@ -268,7 +268,7 @@ class _Finder:
         return _Tool(body, offset, self._turned(body, direction), shaft_body, point, axis, shapes, contact, contact[0])
 
     def _tip_point(self, body: int, offset: FloatArray | None, last: FloatArray, along: FloatArray) -> FloatArray:
-        """The tip: the frame that marks it, else the farthest point of the last links from the last joint."""
+        """The tip: a frame marking it, else the farthest point of the last links from the last joint."""
         if offset is not None:
             return self._world(body, offset)
         survey = self.survey
@@ -296,8 +296,8 @@ class _Finder:
         balls = [g for g in geoms if model.geom_type[g] == SPHERE and far[g] <= ONE_MM]
         if not balls:
             return ()
-        rest = sorted((geom for geom in geoms if geom != balls[0]), key=lambda geom: far[geom])
-        return tuple(model.geom(geom).name for geom in (balls[0], *rest))
+        others = sorted((geom for geom in geoms if geom != balls[0]), key=lambda geom: far[geom])
+        return tuple(model.geom(geom).name for geom in (balls[0], *others))
 
     def _mounted_tool(self, body: int, offset: FloatArray | None, length: float) -> _Tool:
         """A straight palpator along the axis of the last hinge, from the outer face of the last link."""
@@ -384,21 +384,21 @@ class _Finder:
         return arm
 
     def _search_home(self, arm: Arm) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Home, trocar, direction into the body and reach, of the pose tried around which the tip reaches most."""
+        """Home, trocar, direction into the body and reach, of the tried pose with the largest reach."""
         best = None
         starts = self._good_starts(arm) if self.centre is None else self._starts_about(self.centre)
         places = [(start, place) for start in starts for place in self._trocars(arm, start)]
         for start, place in places:
             arm.trocar = place
             into = arm.shaft_line(start)[1]
-            found = self._at_depth(arm, place, into, start)
-            into = into if found is None else arm.shaft_line(found)[1]
+            home = self._at_depth(arm, place, into, start)
+            into = into if home is None else arm.shaft_line(home)[1]
             # The mechanism of a remote centre holds its tool by links about it.
-            if found is None or (self.centre is None and self._blocked(arm, found)):
+            if home is None or (self.centre is None and self._blocked(arm, home)):
                 continue
-            share = reach_share(arm, found, into)
+            share = reach_share(arm, home, into)
             if best is None or share > best[3] + 1e-9:
-                best = found, arm.trocar.copy(), into, share
+                best = home, arm.trocar.copy(), into, share
             if share == 1.0:
                 break
         if best is None:
@@ -410,7 +410,7 @@ class _Finder:
         return best
 
     def _trocars(self, arm: Arm, start: FloatArray) -> list[FloatArray]:
-        """Trocars to be tried from a pose: where its shaft crosses the first joint's axis, and HOME_DEPTH from the tip.
+        """Trocars to be tried from a pose: the shaft's crossing with the first axis, and HOME_DEPTH from the tip.
 
         An arm with few joints turns its shaft only about a point of its first axis: such as the linkage of a remote
         centre, which is open in a URDF.
@@ -431,16 +431,16 @@ class _Finder:
         """Joint values near a start with the tip HOME_DEPTH past the trocar, pointing along the shaft if it can."""
         place = trocar + HOME_DEPTH * into
         for direction in (into, None):
-            found = solve_pose(arm, place, direction=direction, start=start)
-            if found.position_error < 1e-6 and self._in_trocar(arm, found) and (direction is None or found.reached):
-                return found.joints
+            pose = solve_pose(arm, place, direction=direction, start=start)
+            if pose.position_error < 1e-6 and self._in_trocar(arm, pose) and (direction is None or pose.reached):
+                return pose.joints
         return None
 
-    def _in_trocar(self, arm: Arm, found: PoseSolution) -> bool:
-        return found.trocar_error <= (FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6)
+    def _in_trocar(self, arm: Arm, pose: PoseSolution) -> bool:
+        return pose.trocar_error <= (FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6)
 
     def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
-        """Poses that differ in the joints before the slide of a remote centre."""
+        """Poses with different joints before the slide of a remote centre."""
         before = np.arange(len(self.chain)) < self.chain.index(centre.joint)
         draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.chain)))
         return [np.where(before, pose, self.zero) for pose in (self.zero, 0.5 * (self.lower + self.upper), *draws)]
@@ -462,7 +462,7 @@ class _Finder:
         return (1.0 - arm.tip_direction(pose)[2]) * min(float(margin.min()) / 0.1, 1.0) * least
 
     def _blocked(self, arm: Arm, joints: FloatArray) -> bool:
-        """Whether the tool passes through a link that neither carries it nor is next to it."""
+        """True if the tool passes through a link other than its carrier or the links next to it."""
         carriers = {self.survey.body_name(part) for part in self.survey.parents(self.tool.shaft_body)[:3]}
         model, data = arm.model, mujoco.MjData(arm.model)
         arm.write(data, joints)
@@ -506,7 +506,7 @@ class _Finder:
         effort = TIP_FORCE * lever + total * np.array(speed) / 0.1
         stated = model.jnt_actfrcrange[self.chain, 1]
         effort = np.where(model.jnt_actfrclimited[self.chain].astype(bool) & (stated > 0.0), stated, effort)
-        return JointControl("servo", speed, *(_figures(one) for one in (stiffness, damping, effort, armature)))
+        return JointControl("servo", speed, *(_figures(values) for values in (stiffness, damping, effort, armature)))
 
     def _covers(self, actuator: int, joint: int) -> bool:
         if not self.model.actuator_ctrllimited[actuator]:
@@ -516,7 +516,7 @@ class _Finder:
         return bool(least <= lower + 1e-9 and most >= upper - 1e-9)
 
     def _held(self, home: FloatArray) -> dict[str, float]:
-        """Values of the joints that are not driven: as coupled to driven ones at home, else 0 or the nearest limit."""
+        """Values of undriven joints: as coupled to driven ones at home, else 0 or the nearest limit."""
         model = self.model
         known = dict(zip(self.chain, home, strict=True))
         pairs = [
@@ -605,17 +605,17 @@ class _Finder:
 
 
 def reach_share(arm: Arm, home: FloatArray, into: FloatArray) -> float:
-    """Share of the places at DEPTHS past the trocar, straight on and tilted by TILT to four sides, that are reached."""
+    """Share of places in reach, of those at DEPTHS past the trocar, straight on and tilted by TILT to four sides."""
     sides = np.stack(tangent_axes(into))
-    ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for one in sides for side in (one, -one))]
+    ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for axis in sides for side in (axis, -axis))]
     places = [arm.trocar + depth * way for way in ways for depth in DEPTHS]
     kept = FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6
-    found = [solve_pose(arm, place, start=home, iterations=60) for place in places]
-    return float(np.mean([one.position_error < 1e-6 and one.trocar_error <= kept for one in found]))
+    poses = [solve_pose(arm, place, start=home, iterations=60) for place in places]
+    return float(np.mean([pose.position_error < 1e-6 and pose.trocar_error <= kept for pose in poses]))
 
 
 def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:
-    """Inertia that each driven joint feels, the diagonal of the mass matrix [kg m^2 or kg], shape (n,)."""
+    """Inertia of each driven joint, the diagonal of the mass matrix [kg m^2 or kg], shape (n,)."""
     data = mujoco.MjData(arm.model)
     arm.write(data, joints)
     mujoco.mj_forward(arm.model, data)
@@ -630,7 +630,6 @@ def _added(name: str, body: str, capsule: Capsule) -> AddedShape:
 
 
 def _is_small(points: FloatArray) -> bool:
-    """Whether a part is no larger than SMALL_PART."""
     return float(np.ptp(points, axis=0).max()) <= SMALL_PART
 
 
@@ -640,5 +639,5 @@ def _figures(values: FloatArray) -> tuple[float, ...]:
 
 
 def _listed(names: Sequence[str], most: int = 6) -> str:
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    others = len(names) - most
+    return ", ".join(names[:most]) + (f" and {others} more" if others > 0 else "")

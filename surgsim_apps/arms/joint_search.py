@@ -1,7 +1,7 @@
-"""Joint values with which an arm reaches many points at once: damped least squares within joint limits, as arrays.
+"""Inverse kinematics of an arm for many points: damped least squares within joint limits, as arrays.
 
-The same aims as `instruments.arm.inverse_kinematics`, weighted instead of ranked, so that each target is one small
-linear system: with W = diag of the weights and e the residual, each step solves
+The aims of `instruments.arm.inverse_kinematics`, weighted instead of ranked, so that each target is one small linear
+system: with W = diag of the weights and e the residual, each step solves
 
     (J^T W J + (k |e|^2 + least) I) dq = J^T W e        (Levenberg-Marquardt; damping after Sugihara 2011)
 
@@ -26,9 +26,9 @@ DIRECTION_WEIGHT = 0.03
 DAMPING_SHARE, DAMPING_LEAST = 0.3, 1e-13
 # Largest step of the joints [s] at their speed limits.
 STRIDE = 0.2
-# Residuals at which a search ends: [m], [rad].
+# Residuals for the end of a search: [m], [rad].
 PLACE_MET, ANGLE_MET = 1e-8, 1e-4
-# The tip is at a point, and the shaft in its trocar, within this [m].
+# Largest distance of a reached point from the tip, and of the trocar from the shaft [m].
 REACHED = 1e-3
 NEIGHBOURS = 3
 # Directions of each ring; every direction covers the same share of the half space.
@@ -40,7 +40,7 @@ APPROACH_ANGLE = math.radians(10.0)
 
 @dataclass
 class Candidates:
-    """Sets of joint values that searches found; n of them, or k for each of n points.
+    """Sets of joint values from searches; n of them, or k for each of n points.
 
     Fields:
         joints: [rad or m]                                          (n, k, n_joint)
@@ -56,7 +56,7 @@ class Candidates:
 
     @property
     def met(self) -> NDArray[np.bool_]:
-        """Which candidates have the tip at its point and the shaft in its trocar, (n, k)."""
+        """Mask of candidates with the tip at its point and the shaft in its trocar, (n, k)."""
         return (self.position_error <= REACHED) & (self.trocar_error <= REACHED)
 
     def add(self, other: "Candidates") -> "Candidates":
@@ -67,7 +67,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Targets: position [m] (n, 3) and direction (n, 3) or None of the tip; whether limits and trocar are respected."""
+    """Targets: position [m] (n, 3) and direction (n, 3) or None of the tip, with or without limits and trocar."""
 
     position: FloatArray
     direction: FloatArray | None = None
@@ -81,7 +81,7 @@ class Wanted:
 
 
 def search_joints(kinematics: BatchKinematics, wanted: Wanted, start: FloatArray) -> Candidates:
-    """Joint values that bring the tip as near to the targets as possible, from starts (n, n_joint) [rad or m]."""
+    """Joint values for the tip's nearest approach to the targets, from starts (n, n_joint) [rad or m]."""
     joints = np.clip(start, kinematics.lower, kinematics.upper) if wanted.limits else start.copy()
     _iterate(kinematics, wanted, joints, ITERATIONS)
     if wanted.direction is not None:
@@ -92,7 +92,7 @@ def search_joints(kinematics: BatchKinematics, wanted: Wanted, start: FloatArray
 
 
 def _iterate(kinematics: BatchKinematics, wanted: Wanted, joints: FloatArray, count: int) -> None:
-    """Iterate in place on the joint values (n, n_joint) whose targets are not met yet."""
+    """Iterate in place on joint values (n, n_joint) of targets not met yet."""
     rows = np.arange(len(joints))
     for _ in range(count):
         error, jacobian, met = _residual(kinematics, wanted.only(rows), joints[rows])
@@ -109,7 +109,7 @@ def _iterate(kinematics: BatchKinematics, wanted: Wanted, joints: FloatArray, co
 def _residual(
     kinematics: BatchKinematics, wanted: Wanted, joints: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Residuals (n, m), their Jacobian (n, m, n_joint), and which targets are met (n,)."""
+    """Residuals (n, m), their Jacobian (n, m, n_joint), and a mask of met targets (n,)."""
     chain = kinematics.at(joints, shapes=False)
     linear, angular = kinematics.tip_jacobian(chain)
     errors, jacobians = [wanted.position - chain.tip], [linear]
@@ -134,7 +134,7 @@ def across(jacobian: FloatArray, axis: FloatArray) -> FloatArray:
 def _bounded_step(
     jacobian: FloatArray, error: FloatArray, lower: FloatArray, upper: FloatArray, scale: FloatArray
 ) -> FloatArray:
-    """Damped least-squares steps (n, n_joint) within bounds; joints that would pass one are held there."""
+    """Damped least-squares steps (n, n_joint); joints are held at their bounds."""
     scaled = jacobian * scale
     damping = DAMPING_SHARE * dot(error, error) + DAMPING_LEAST
     free = np.ones(lower.shape, dtype=bool)
@@ -156,7 +156,7 @@ def _bounded_step(
 
 
 def turns_between(now: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Smallest rotation vectors [rad] that take unit vectors to others, (n, 3)."""
+    """Smallest rotation vectors [rad] between unit vectors, (n, 3)."""
     axis = cross(now, wanted)
     sine, cosine = np.linalg.norm(axis, axis=1), dot(now, wanted)
     return axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None]
@@ -182,44 +182,48 @@ def from_starts(
     return _search(kinematics, wanted, begin, (count, each))
 
 
-def from_neighbours(kinematics: BatchKinematics, tips: FloatArray, found: Candidates) -> Candidates:
-    """Candidates for points that have none, started from those of the nearest points that have one."""
-    met = found.met
+def from_neighbours(kinematics: BatchKinematics, tips: FloatArray, candidates: Candidates) -> Candidates:
+    """Candidates for points without one, started from those of the nearest points with one."""
+    met = candidates.met
     has = met.any(axis=1)
     need = np.flatnonzero(~has)
     if need.size == 0 or not has.any():
-        return found
+        return candidates
     first = np.where(has, met.argmax(axis=1), 0)
     tree, owners = KDTree(tips[has]), np.flatnonzero(has)
     near = owners[tree.query(tips[need], k=min(NEIGHBOURS, len(owners)))[1].reshape(len(need), -1)]
-    more = from_starts(kinematics, tips[need], found.joints[near, first[near]])
+    more = from_starts(kinematics, tips[need], candidates.joints[near, first[near]])
     rows = np.arange(near.shape[1])
     for index, point in enumerate(need):
-        for name in vars(found):
-            getattr(found, name)[point, rows] = getattr(more, name)[index]
-    return found
+        for name in vars(candidates):
+            getattr(candidates, name)[point, rows] = getattr(more, name)[index]
+    return candidates
 
 
 def from_directions(
-    kinematics: BatchKinematics, tips: FloatArray, directions: FloatArray, found: Candidates, usable: NDArray[np.bool_]
+    kinematics: BatchKinematics,
+    tips: FloatArray,
+    directions: FloatArray,
+    candidates: Candidates,
+    usable: NDArray[np.bool_],
 ) -> Candidates:
-    """A candidate for each approach direction (n, 32, 3), begun at the usable one that points most nearly that way."""
-    cosine = -np.einsum("nki,ndi->ndk", found.pointing, directions)
+    """A candidate for each approach direction (n, 32, 3), begun at the usable one of the smallest angle to it."""
+    cosine = -np.einsum("nki,ndi->ndk", candidates.pointing, directions)
     cosine = np.where(usable[:, None], cosine, -np.inf)
     best = cosine.argmax(axis=2)
     rows = np.arange(len(tips))[:, None]
-    begin = found.joints[rows, best].reshape(-1, kinematics.arm.joint_count)
+    begin = candidates.joints[rows, best].reshape(-1, kinematics.arm.joint_count)
     wanted = Wanted(np.repeat(tips, DIRECTION_COUNT, axis=0), -directions.reshape(-1, 3))
     return _search(kinematics, wanted, begin, (len(tips), DIRECTION_COUNT))
 
 
 def _search(kinematics: BatchKinematics, wanted: Wanted, begin: FloatArray, shape: tuple[int, int]) -> Candidates:
-    found = vars(search_joints(kinematics, wanted, begin)).values()
-    return Candidates(*(values.reshape(*shape, *values.shape[1:]) for values in found))
+    fields = vars(search_joints(kinematics, wanted, begin)).values()
+    return Candidates(*(values.reshape(*shape, *values.shape[1:]) for values in fields))
 
 
 def approach_directions(normals: FloatArray, towards: FloatArray, line: FloatArray) -> FloatArray:
-    """Unit vectors out of the tissue, from which a tip may come, about outward normals (n, 3), shape (n, 32, 3).
+    """Approach directions of a tip, unit vectors out of the tissue about outward normals (n, 3), shape (n, 32, 3).
 
     Rings of 1, 6, 11 and 14 directions lie in the middles of bands of equal area: after k of 32 directions a band of m
     has cos(theta) = 1 - (k + m/2) / 32 (the first is the normal itself). Azimuths are evenly spaced. The first is that
@@ -231,16 +235,16 @@ def approach_directions(normals: FloatArray, towards: FloatArray, line: FloatArr
     first[short] = _tangential(np.broadcast_to(line, first.shape), normals)[short]
     first /= np.linalg.norm(first, axis=1)[:, None]
     second = np.cross(normals, first)
-    found = [normals]
+    directions = [normals]
     before = 1
     for count in RINGS[1:]:
         cosine = 1.0 - (before + 0.5 * count) / DIRECTION_COUNT
         sine = math.sqrt(1.0 - cosine**2)
         for index in range(count):
             azimuth = 2.0 * math.pi * index / count
-            found.append(cosine * normals + sine * (math.cos(azimuth) * first + math.sin(azimuth) * second))
+            directions.append(cosine * normals + sine * (math.cos(azimuth) * first + math.sin(azimuth) * second))
         before += count
-    return np.stack(found, axis=1)
+    return np.stack(directions, axis=1)
 
 
 def _tangential(vectors: FloatArray, normals: FloatArray) -> FloatArray:
@@ -248,6 +252,6 @@ def _tangential(vectors: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def directions_met(pointing: FloatArray, usable: NDArray[np.bool_], directions: FloatArray) -> NDArray[np.bool_]:
-    """Which directions (n, 32, 3) usable tips (n, k), pointing along (n, k, 3), have within 10 degrees, (n, 32)."""
+    """Mask of directions (n, 32, 3) within 10 degrees of usable tips (n, k) that point along (n, k, 3), (n, 32)."""
     cosine = -np.einsum("nki,ndi->nkd", pointing, directions)
     return np.any((cosine >= math.cos(APPROACH_ANGLE)) & usable[:, :, None], axis=1)

@@ -1,7 +1,7 @@
-"""An arm's kinematics at many joint values at once: tip, shaft and shapes as arrays, no state.
+"""Batch kinematics of an arm: tip, shaft and shapes at many joint values, as arrays without state.
 
-`Arm` asks MuJoCo about one set of joint values at a time. An evaluation asks about tens of thousands, so the same
-chain of bodies, read from the same model, is multiplied out here for all of them together; tests hold the two equal.
+`Arm` asks MuJoCo about one set of joint values at a time. An evaluation needs tens of thousands: the same chain of
+bodies, from the same model, is multiplied out here for all of them together; tests hold the two equal.
 """
 
 from dataclasses import dataclass
@@ -40,10 +40,10 @@ class BatchKinematics:
     Fields:
         arm: the arm
         lower, upper: limits [rad or m]                     (n_joint,)
-        hinge: whether a joint turns or slides              (n_joint,)
-        shaft_index: shapes that the shaft's body carries   (k,)
-        distal: whether a shape is the shaft's or beyond    (n_shape,)
-        effort: largest torque or force of each joint [N m or N], inf where the model states none  (n_joint,)
+        hinge: True for a hinge, False for a slide          (n_joint,)
+        shaft_index: shapes of the shaft's body             (k,)
+        distal: True for shapes of the shaft or beyond      (n_shape,)
+        effort: largest torque or force of each joint [N m or N], inf for a model without it  (n_joint,)
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -163,11 +163,11 @@ def _turns(axis: FloatArray, angle: FloatArray) -> FloatArray:
 
 def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
     """A body and all bodies between it and the world."""
-    found = {body}
+    bodies = {body}
     while body:
         body = int(model.body_parentid[body])
-        found.add(body)
-    return found
+        bodies.add(body)
+    return bodies
 
 
 def _effort(model: mujoco.MjModel, joint: int) -> float:

@@ -1,4 +1,4 @@
-"""Heat maps of two arms on an organ's surface, and a picture of both at home where there is OpenGL."""
+"""Heat maps of two arms on an organ's surface, and with OpenGL a picture of both at home."""
 
 from __future__ import annotations
 
@@ -13,16 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
+from surgsim_apps.arms.arm_picture import filling_camera
 from surgsim_apps.arms.ports import Ports
-from surgsim_apps.arms.results import (
-    QUANTITIES,
-    ArmsEvaluation,
-    Quantity,
-    share_text,
-    sides,
-    values_of,
-    worse_of_both,
-)
+from surgsim_apps.arms.quantities import QUANTITIES, Quantity
+from surgsim_apps.arms.results import ArmsEvaluation
+from surgsim_apps.arms.wording import share_text
 from surgsim_apps.reports.html_page import Picture
 from surgsim_apps.reports.output_folder import AnyFolder
 from surgsim_apps.reports.surface_drawing import (
@@ -34,7 +29,7 @@ from surgsim_apps.reports.surface_drawing import (
     save_png,
 )
 from surgsim_env.instruments import Arm
-from surgsim_env.rendering import DrawnCapsule, draw_still, filling
+from surgsim_env.rendering import DrawnCapsule, draw_still
 from surgsim_env.step_progress import StepProgress
 
 if TYPE_CHECKING:
@@ -44,28 +39,28 @@ if TYPE_CHECKING:
 # Distinct for all kinds of colour blindness: viridis, which contains no grey, and Okabe & Ito's colours.
 COLOUR_MAP = "viridis"
 LEFT, RIGHT, BOTH, APART, NEITHER = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#bdbdbd"
-# Colour of parts where no point was tried.
+# Colour of parts without a tried point.
 UNTRIED = "#f4e6de"
-# Further from every point than this many of their usual distances, a part of the organ was not tried.
+# Largest distance of a tried part of the organ from a point, over the points' usual spacing.
 TRIED_WITHIN = 2.0
 PORT_MARKS = {"left": ("L", LEFT), "right": ("R", RIGHT), "endoscope": ("E", INK)}
 SPLITS = 2
 NEIGHBOURS = 4
-# Points whose normals differ by a right angle count as this much farther apart than they are, as a share of the
-# organ's size: values of one side do not show on the other side of a thin lobe.
+# Extra distance between points with normals at a right angle, as a share of the organ's size: values of one side do not
+# show on the other side of a thin lobe.
 NORMAL_WEIGHT = 0.15
 DPI = 100
-# Share of a colour that the light does not change.
+# Share of a colour unaffected by light.
 FLATNESS = 0.6
 
-# Of a map: title, which points have a value, and the values [SI].
+# Of a map: title, mask of points with a value, and the values [SI].
 Panel = tuple[str, NDArray[np.bool_], FloatArray]
 SIZE = 960, 720
 SCOPE, PORT, WALL = (0.36, 0.39, 0.44, 1.0), (0.95, 0.75, 0.2, 1.0), (0.85, 0.65, 0.55, 0.18)
 SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
-# The endoscope is drawn this far out of its port [m].
+# Length of the drawn endoscope outside its port [m].
 SCOPE_OUTSIDE = 0.18
-# Field of view of the camera beside the table [degrees], and share of the picture that the arms fill.
+# Field of view of the camera beside the table [degrees], and share of the arms in the picture.
 BESIDE_FOV, SHARE = 35.0, 0.85
 
 
@@ -107,11 +102,11 @@ class ArmMaps:
         from matplotlib.figure import Figure
         from matplotlib.lines import Line2D
 
-        one = self.evaluation
-        left, right = one.left.reachable, one.right.reachable
+        evaluation = self.evaluation
+        left, right = evaluation.left.reachable, evaluation.right.reachable
         either = np.where(left, np.where(right, 2, 0), np.where(right, 1, 3))
         # Each arm reaches the point alone, but the arms would come too close.
-        kind = np.where((either == 2) & ~one.both, 4, either)
+        kind = np.where((either == 2) & ~evaluation.both, 4, either)
         palette = np.array([to_rgb(colour) for colour in (LEFT, RIGHT, BOTH, NEITHER, APART)])
         names = ("left arm only", "right arm only", "both at once", "neither", "each, but not both at once")
         figure = Figure(figsize=(7.5, 4.2), dpi=DPI, facecolor=PAPER, layout="constrained")
@@ -130,9 +125,9 @@ class ArmMaps:
         return Picture.of_file(folder / "map_reach.png", "Who reaches what", f"The organ's parts: {', '.join(labels)}.")
 
     def _write_quantity(self, folder: AnyFolder, quantity: Quantity) -> Picture:
-        one = self.evaluation
-        panels = [(f"{side} arm", arm.reachable, values_of(arm, quantity)) for side, arm in sides(one)]
-        panels.append(("both at once, the worse arm", one.both, worse_of_both(one, quantity)))
+        evaluation = self.evaluation
+        panels = [(f"{side} arm", arm.reachable, quantity.values(arm)) for side, arm in evaluation.arms.items()]
+        panels.append(("both at once, the worse arm", evaluation.both, quantity.worse_of_both(evaluation)))
         name = f"map_{quantity.field}.png"
         sense = "more is better" if quantity.more_is_better else "less is better"
         label = f"{quantity.label}\n{sense}"
@@ -170,7 +165,7 @@ class ArmMaps:
         save_png(figure, path)
 
     def _painted(self, values: FloatArray, mask: NDArray[np.bool_], norm: Normalize) -> FloatArray:
-        """Colours of the patches: the points around each, those that are reached, weighted by nearness."""
+        """Colours of the patches: means over the reached points around each, weighted by nearness."""
         from matplotlib import colormaps
 
         weight = mask[self._nearest] / np.maximum(self._distance, 1e-6) ** 2
@@ -180,18 +175,20 @@ class ArmMaps:
 
     def _draw(self, axes: Axes, colours: FloatArray, dots: FloatArray, title: str) -> None:
         """The organ painted, its points as dots, inner targets as diamonds, and the ports."""
-        one, view = self.evaluation, self._view
+        evaluation, view = self.evaluation, self._view
         from matplotlib.colors import to_rgb
 
         painted = np.where(self._tried[:, None], colours, to_rgb(UNTRIED))
         # No gloss and little shading, which would look like values.
         draw_patches(axes, [(self._patches, painted, 0.0)], view, flatness=FLATNESS)
-        facing = ~one.inner & (one.normals @ view.towards > 0.1)
-        axes.scatter(*view.flat(one.points[facing]).T, s=3.0, color=INK, alpha=0.45, linewidths=0, zorder=2)
-        if one.inner.any():
-            places = view.flat(one.points[one.inner])
-            axes.scatter(*places.T, s=26, marker="D", c=dots[one.inner], edgecolors=INK, linewidths=0.8, zorder=3)
-        _mark_ports(axes, one, view)
+        facing = ~evaluation.inner & (evaluation.normals @ view.towards > 0.1)
+        axes.scatter(*view.flat(evaluation.points[facing]).T, s=3.0, color=INK, alpha=0.45, linewidths=0, zorder=2)
+        if evaluation.inner.any():
+            places = view.flat(evaluation.points[evaluation.inner])
+            axes.scatter(
+                *places.T, s=26, marker="D", c=dots[evaluation.inner], edgecolors=INK, linewidths=0.8, zorder=3
+            )
+        _mark_ports(axes, evaluation, view)
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_aspect("equal")
         axes.margins(0.03)
@@ -249,7 +246,7 @@ def draw_arms(evaluation: ArmsEvaluation, arms: Sequence[Arm], ports: Ports) -> 
     if (ends.mean(axis=0) - evaluation.surface_points.mean(axis=0)) @ away > 0.0:
         away = -away
     seen = np.concatenate([ends, evaluation.surface_points])
-    camera = filling(seen, 0.88 * away + 0.48 * up, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
+    camera = filling_camera(seen, 0.88 * away + 0.48 * up, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
     surface = evaluation.surface_points, evaluation.surface_triangles
     return draw_still(surface, posed, capsules, [camera], SIZE)[0]
 

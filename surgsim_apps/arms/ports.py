@@ -1,4 +1,4 @@
-"""Where two arms and the endoscope enter a patient: a ports file, its defaults, and the body wall they pass."""
+"""Ports of two arms and the endoscope: a ports file, its defaults, and the body wall."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class PortPlace:
     Args:
         point: the trocar [m].
         into: direction into the body, or
-        target: the point that the instrument points at [m].
+        target: the point on the instrument's line [m].
         roll: turn of the arm's base about that direction [rad].
     """
 
@@ -46,7 +46,7 @@ class PortPlace:
 
 @dataclass(frozen=True)
 class EndoscopePort:
-    """The port of the endoscope [m] and the point that it looks at [m]."""
+    """The port of the endoscope and the point in its line of sight [m]."""
 
     point: Vector
     target: Vector
@@ -57,7 +57,7 @@ class EndoscopePort:
 
 @dataclass(frozen=True)
 class InnerTarget:
-    """A point inside the patient that both arms should reach [m]."""
+    """A target of both arms inside the patient [m]."""
 
     point: Vector
 
@@ -68,7 +68,7 @@ class Wall:
 
     Args:
         thickness: [m].
-        hole: distance from a trocar within which shapes may pass [m].
+        hole: radius of the free passage at a trocar [m].
         radius: of the dome [m]; 20 cm is chosen for an insufflated abdomen.
         plate: an infinite plate instead of the dome.
     """
@@ -139,20 +139,20 @@ class Ports:
             ValueError: names the port, its place and the organ.
         """
         for name, port in self.frames.items():
-            check_port_outside(port, anatomy, what=f"the {name} port")
+            check_port_outside(port, anatomy, name=f"the {name} port")
 
 
 def read_ports(path: str | Path) -> Ports:
-    """The ports that a TOML file describes.
+    """Ports of a TOML file.
 
     Raises:
-        ValueError: a file that cannot be read, or the entry that is wrong in it.
+        ValueError: an unreadable file, or its wrong entry.
     """
     return ports_from_table(read_toml(Path(path), "ports"), name=Path(path).stem)
 
 
 def ports_from_table(table: dict[str, Any], *, name: str) -> Ports:
-    """Ports from a table such as a TOML file holds."""
+    """Ports from the table of a TOML file."""
     return fill(Ports, table, f"ports {name!r}")
 
 

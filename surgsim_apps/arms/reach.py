@@ -1,4 +1,4 @@
-"""Points that an arm reaches, reasons for the others, and its dexterity there; points that both arms reach at once."""
+"""Reach of an arm, its dexterity at points in reach, reasons for the others; reach of both arms at once."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -22,11 +22,11 @@ from surgsim_apps.arms.joint_search import (
 from surgsim_apps.arms.kinematics import BatchKinematics, Chain, cross, dot
 from surgsim_apps.arms.results import ArmReach
 
-# Number of candidates whose clearance is computed at once.
+# Candidates in a batch of clearances.
 CANDIDATES_AT_ONCE = 20_000
-# Arms at once keep this apart [m].
+# Smallest distance between arms in reach at once [m].
 ARM_DISTANCE = 0.005
-# Candidates of each arm that are paired where the reported joints come too close.
+# Candidates of each arm for other pairs, when the reported joints come too close.
 WAYS = 6
 # One radian of rotation of the tip counts as this travel [m].
 CHARACTERISTIC_LENGTH = 0.1
@@ -34,20 +34,20 @@ CHARACTERISTIC_LENGTH = 0.1
 
 @dataclass(frozen=True)
 class Sites:
-    """Targets of the arms: points and outward normals (n, 3) [m], and which lie inside the organ (n,)."""
+    """Targets of the arms: points and outward normals (n, 3) [m], and a mask of those inside the organ (n,)."""
 
     points: FloatArray
     normals: FloatArray
     inner: NDArray[np.bool_]
 
     def tips(self, ball: float) -> FloatArray:
-        """Where the tip is when its ball [m] touches the surface; at an inner target, the target itself."""
+        """Places of a tip with its ball [m] on the surface; an inner target itself, (n, 3)."""
         return self.points + np.where(self.inner, 0.0, ball)[:, None] * self.normals
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Reach of an arm: its report, all candidates, and which of these pass every test (n, k)."""
+    """Reach of an arm: its report, all candidates, and a mask of usable ones, past every test (n, k)."""
 
     report: ArmReach
     kinematics: BatchKinematics
@@ -56,7 +56,7 @@ class Reach:
 
 
 def tip_ball(kinematics: BatchKinematics) -> float:
-    """Radius of the ball at whose centre the tip lies [m], 0 without one."""
+    """Radius of the ball centred at the tip [m], 0 without one."""
     arm = kinematics.arm
     name = arm.description.tip.ball
     if name is None:
@@ -70,9 +70,9 @@ def tip_ball(kinematics: BatchKinematics) -> float:
 def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles) -> Reach:
     """Reach and dexterity of one arm at every site.
 
-    A point is reached if among the candidates from all starts, directions and neighbours one puts the tip within 1 mm
-    of it, keeps limits and trocar and clears organ and wall. The reported joints are those of the
-    usable candidate furthest from the joint limits.
+    A point is reached if a candidate from any start, direction or neighbour puts the tip within 1 mm of it, keeps
+    limits and trocar and clears organ and wall. The reported joints are those of the usable candidate furthest from
+    the joint limits.
     """
     ports = around.ports
     directions = approach_directions(
@@ -81,13 +81,13 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles)
         np.array(ports.right.point) - np.array(ports.left.point),
     )
     search = _Search(kinematics, sites, around, sites.tips(around.ball), directions)
-    found = from_starts(kinematics, search.tips, spread_starts(kinematics))
-    found = from_neighbours(kinematics, search.tips, found)
-    found, clear = search.all_around(found, search.clear(found))
+    candidates = from_starts(kinematics, search.tips, spread_starts(kinematics))
+    candidates = from_neighbours(kinematics, search.tips, candidates)
+    candidates, clear = search.all_around(candidates, search.clear(candidates))
     usable = _every(clear)
-    reason = _reasons(search, found, clear)
-    report = _report(search, found, usable, reason)
-    return Reach(report, kinematics, found, usable)
+    reason = _reasons(search, candidates, clear)
+    report = _report(search, candidates, usable, reason)
+    return Reach(report, kinematics, candidates, usable)
 
 
 @dataclass(frozen=True)
@@ -100,40 +100,40 @@ class _Search:
     tips: FloatArray
     directions: FloatArray
 
-    def all_around(self, found: Candidates, clear: NDArray[np.bool_]) -> tuple[Candidates, NDArray[np.bool_]]:
-        """More candidates, from every direction, twice: begun at any that meets the point, then at the usable ones."""
-        for begin in (found.met, None):
+    def all_around(self, candidates: Candidates, clear: NDArray[np.bool_]) -> tuple[Candidates, NDArray[np.bool_]]:
+        """Further candidates from every direction, in two rounds: begun at any at the point, then at usable ones."""
+        for begin in (candidates.met, None):
             if begin is None:
-                # Where none is usable, the second round too begins at candidates that meet the point.
+                # Without a usable one, the second round too begins at any candidate at the point.
                 usable = _every(clear)
-                begin = np.where(np.any(usable, axis=1, keepdims=True), usable, found.met)
-            lacking = ~directions_met(found.pointing, _every(clear), self.directions)
-            wanted = lacking & np.any(found.met, axis=1, keepdims=True)
+                begin = np.where(np.any(usable, axis=1, keepdims=True), usable, candidates.met)
+            lacking = ~directions_met(candidates.pointing, _every(clear), self.directions)
+            wanted = lacking & np.any(candidates.met, axis=1, keepdims=True)
             rows = np.flatnonzero(np.any(wanted, axis=1))
-            more = _empty_like(found, self.directions.shape[1])
+            more = _empty_like(candidates, self.directions.shape[1])
             if rows.size:
                 directions, tips = self.directions[rows], self.tips[rows]
                 part = from_directions(
                     self.kinematics,
                     tips,
                     directions,
-                    Candidates(*(one[rows] for one in vars(found).values())),
+                    Candidates(*(values[rows] for values in vars(candidates).values())),
                     begin[rows],
                 )
                 for name in vars(more):
                     getattr(more, name)[rows] = getattr(part, name)
             clear = np.concatenate([clear, self.clear(more)], axis=2)
-            found = found.add(more)
-        return found, clear
+            candidates = candidates.add(more)
+        return candidates, clear
 
-    def clear(self, found: Candidates) -> NDArray[np.bool_]:
-        """Which candidates meet their point, and of these which clear the organ, and the wall: (3, n, k)."""
-        result = np.zeros((3, *found.met.shape), dtype=bool)
-        result[0] = found.met
-        points, places = np.nonzero(found.met)
+    def clear(self, candidates: Candidates) -> NDArray[np.bool_]:
+        """Masks of candidates at their point, and of these clear of the organ, and of the wall: (3, n, k)."""
+        result = np.zeros((3, *candidates.met.shape), dtype=bool)
+        result[0] = candidates.met
+        points, places = np.nonzero(candidates.met)
         for low in range(0, len(points), CANDIDATES_AT_ONCE):
             point, place = points[low : low + CANDIDATES_AT_ONCE], places[low : low + CANDIDATES_AT_ONCE]
-            chain = self.kinematics.at(found.joints[point, place])
+            chain = self.kinematics.at(candidates.joints[point, place])
             off_organ = self.around.organ_clearance(self.kinematics, chain, exact=False) >= 0.0
             result[1, point, place] = off_organ | self.sites.inner[point]
             result[2, point, place] = self.around.wall_clearance(self.kinematics, chain) >= 0.0
@@ -141,28 +141,28 @@ class _Search:
 
 
 def _every(clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which candidates pass every test, (n, k)."""
+    """Mask of candidates past every test, (n, k)."""
     return np.logical_and.reduce(clear, axis=0)
 
 
-def _empty_like(found: Candidates, count: int) -> Candidates:
-    """Candidates that meet nothing."""
-    points, _, joints = found.joints.shape
+def _empty_like(candidates: Candidates, count: int) -> Candidates:
+    """Candidates far from every point."""
+    points, _, joints = candidates.joints.shape
     errors = np.full((points, count), np.inf)
     return Candidates(np.zeros((points, count, joints)), errors, errors.copy(), np.zeros((points, count, 3)))
 
 
-def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> IntArray:
-    """Index into REASONS of each point: the first test that no candidate passes, (n,)."""
+def _reasons(search: _Search, candidates: Candidates, clear: NDArray[np.bool_]) -> IntArray:
+    """Index into REASONS of each point: the first test without a passing candidate, (n,)."""
     kinematics, tips = search.kinematics, search.tips
     reason = np.where(np.any(_every(clear[:2]), axis=1), 5, 4)
     reason[np.any(_every(clear), axis=1)] = 0
     lost = np.flatnonzero(~np.any(clear[0], axis=1))
     if lost.size:
         starts = spread_starts(kinematics)
-        best = np.argmin(found.position_error[lost] + found.trocar_error[lost], axis=1)
+        best = np.argmin(candidates.position_error[lost] + candidates.trocar_error[lost], axis=1)
         own = np.concatenate(
-            [np.broadcast_to(starts, (lost.size, *starts.shape)), found.joints[lost, best][:, None]], axis=1
+            [np.broadcast_to(starts, (lost.size, *starts.shape)), candidates.joints[lost, best][:, None]], axis=1
         )
         reason[lost] = 1
         free = from_starts(kinematics, tips[lost], own, limits=False, trocar=False)
@@ -172,13 +172,13 @@ def _reasons(search: _Search, found: Candidates, clear: NDArray[np.bool_]) -> In
     return reason.astype(np.int32)
 
 
-def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
+def _report(search: _Search, candidates: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
     kinematics, sites, around = search.kinematics, search.sites, search.around
     rows, good = np.arange(len(reason)), reason == 0
-    worth = np.where(usable, limit_margin(kinematics, found.joints), -np.inf)
-    nearest = np.argmin(found.position_error + found.trocar_error, axis=1)
+    worth = np.where(usable, limit_margin(kinematics, candidates.joints), -np.inf)
+    nearest = np.argmin(candidates.position_error + candidates.trocar_error, axis=1)
     best = np.where(good, worth.argmax(axis=1), nearest)
-    joints = found.joints[rows, best]
+    joints = candidates.joints[rows, best]
     chain = kinematics.at(joints)
     values = scaled_singular_values(kinematics, chain)
     organ = np.full(len(rows), np.nan)
@@ -193,8 +193,8 @@ def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reaso
         name=kinematics.arm.description.name,
         reason=reason,
         joints=joints,
-        position_error=found.position_error[rows, best],
-        approach_share=where_reached(directions_met(found.pointing, usable, search.directions).mean(axis=1)),
+        position_error=candidates.position_error[rows, best],
+        approach_share=where_reached(directions_met(candidates.pointing, usable, search.directions).mean(axis=1)),
         manipulability=where_reached(manipulability(values)),
         isotropy=where_reached(isotropy(values)),
         limit_margin=where_reached(limit_margin(kinematics, joints)),
@@ -209,10 +209,10 @@ def _report(search: _Search, found: Candidates, usable: NDArray[np.bool_], reaso
 
 @dataclass(frozen=True)
 class BothArms:
-    """Points that both arms reach at once.
+    """Points in reach of both arms at once.
 
     Fields:
-        reachable: which they are                                                       (n,)
+        reachable: mask of them                                                         (n,)
         inside, outside: the pair's smallest distances inside and outside the body [m]  (n,)
         joints: of the left and the right arm in that pair [rad or m]                   (n, n_joint) each
     """
@@ -224,7 +224,7 @@ class BothArms:
 
 
 def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
-    """Points that both arms reach at once: with the reported joints, else with the best of 6 x 6 other pairs."""
+    """Points in reach of both arms at once: with the reported joints, else with the best of 6 x 6 other pairs."""
     inside, outside = np.full(len(points), np.nan), np.full(len(points), np.nan)
     joints = left.report.joints.copy(), right.report.joints.copy()
     rows = np.flatnonzero(left.report.reachable & right.report.reachable)
@@ -261,15 +261,15 @@ def pair_distances(
     kinematics: tuple[BatchKinematics, BatchKinematics], joints: tuple[FloatArray, FloatArray], points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """`arm_distances` of the left and the right arm at joint values (n, n_joint) each."""
-    first, second = ((one, one.at(values)) for one, values in zip(kinematics, joints, strict=True))
+    first, second = ((arm, arm.at(values)) for arm, values in zip(kinematics, joints, strict=True))
     return arm_distances(first, second, points)
 
 
 def scaled_singular_values(kinematics: BatchKinematics, chain: Chain) -> FloatArray:
     """Singular values, largest first, of J = [J_v; L J_w] with L = 0.1 m, shape (n, k).
 
-    k is the smaller of 6 and the degrees of freedom that the trocar leaves: where control keeps the shaft in the
-    trocar, J acts on the n_joint - 2 motions that keep it there.
+    k is the smaller of 6 and the degrees of freedom with the shaft in the trocar: if control keeps it there, J acts on
+    the remaining n_joint - 2 motions.
     """
     linear, angular = kinematics.tip_jacobian(chain)
     jacobian = np.concatenate([linear, CHARACTERISTIC_LENGTH * angular], axis=1)
@@ -310,10 +310,10 @@ def tip_force(kinematics: BatchKinematics, chain: Chain, directions: FloatArray)
 def trocar_load(kinematics: BatchKinematics, chain: Chain, directions: FloatArray) -> FloatArray:
     """Sideways force on the trocar [N] at 1 N on the tip along unit vectors (n, 3), (n,).
 
-    The shaft is a lever, supported by the trocar and held at its outer end without a moment: the case of an arm whose
-    mechanism does not fix the remote centre. Moments about the outer end o, with the shaft's direction a, the
-    tip x and the trocar t: N = |a x ((x - o) x f)| / (t - o).a; for a straight instrument and a sideways force that
-    is (outer + inner length) / outer length. NaN where no shape of the shaft reaches outside.
+    The shaft is a lever, supported by the trocar and held at its outer end without a moment, as by an arm without a
+    mechanical remote centre. Moments about the outer end o, with the shaft's direction a, the tip x and the trocar t:
+    N = |a x ((x - o) x f)| / (t - o).a; for a straight instrument and a sideways force that is (outer + inner length) /
+    outer length. NaN for a shaft without a shape outside.
     """
     ends = chain.shape_ends[:, kinematics.shaft_index].reshape(len(chain.tip), -1, 3)
     if ends.shape[1] == 0:

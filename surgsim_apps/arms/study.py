@@ -1,4 +1,4 @@
-"""Two arms on a patient's anatomy: reach, dexterity and clearances evaluated; setups ranked; report and files."""
+"""Evaluation of two arms on a patient's anatomy, and a study of several setups with its files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,49 +12,34 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.pictures import ArmMaps, draw_arms, write_picture
+from surgsim_apps.arms.points_file import write_points
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
+from surgsim_apps.arms.quantities import QUANTITIES
+from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.reach import (
     Sites,
     evaluate_both,
     evaluate_reach,
     tip_ball,
 )
-from surgsim_apps.arms.results import (
-    DISTANCES,
-    QUANTITIES,
-    RANKING_RULE,
-    REASONS,
-    SHARE_DEFINITIONS,
-    SIDES,
-    ArmsEvaluation,
-    Ranked,
-    number_text,
-    rank,
-    share_text,
-    sides,
-    spread,
-    values_of,
-    verdict,
-    worse_of_both,
-    write_points,
-)
-from surgsim_apps.arms.through_cycle import cycle_section, evaluate_cycle
-from surgsim_apps.reports.html_page import Picture, render_page
+from surgsim_apps.arms.report import write_report
+from surgsim_apps.arms.results import ArmsEvaluation
+from surgsim_apps.arms.through_cycle import evaluate_cycle
+from surgsim_apps.arms.wording import verdict
 from surgsim_apps.reports.output_folder import AnyFolder
-from surgsim_env.instruments import load_arm
+from surgsim_env.instruments import SIDES, load_arm
 from surgsim_env.rendering import NoGLError
 from surgsim_env.scene import Anatomy, ArmDescription, Scene, load_anatomy, make_scene
 from surgsim_env.step_progress import StepProgress
 
-# Places from which each point is chosen.
+# Candidates for each point.
 PLACES_PER_POINT = 12
 REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
-# Every file that a study can write; which pictures there are depends on the arms and OpenGL.
+# All possible files of a study; the pictures depend on the arms and OpenGL.
 RESULT_NAMES = (
     *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, "map_reach.png"),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
 )
-Rows = list[tuple[str, ...]]
 
 
 def evaluate_arms(
@@ -73,17 +58,17 @@ def evaluate_arms(
     A scene with motions is evaluated through their cycle too: `ArmsEvaluation.cycle`.
 
     Args:
-        scene: a scene's name, its TOML file, or what is loaded from these.
-        left: a shipped arm's name or the TOML file of one's own.
+        scene: a scene's name, its TOML file, or the loaded scene or anatomy.
+        left: a shipped arm's name, a TOML file or a description.
         right: likewise.
-        ports: a ports file, or the result of `read_ports`; `default_ports` where none is given.
+        ports: a ports file, or the result of `read_ports`; by default `default_ports`.
         seed: draws the first point of the surface.
         count: number of points of the surface.
         progress: shows the steps.
-        picture: whether to draw the arms in the patient; without OpenGL there is none, `progress` says why.
+        picture: True to draw the arms in the patient; without OpenGL there is none, `progress` says why.
 
     Raises:
-        ValueError: one line with what is wrong in scene, arm or ports, and the way out.
+        ValueError: a wrong scene, arm or port, in one line with the way out.
     """
     progress = progress or StepProgress()
     if not isinstance(scene, Anatomy):
@@ -112,7 +97,7 @@ def evaluate_arms(
         obstacles = around[0], around[1]
         cycle = evaluate_cycle((reaches[0], reaches[1]), both, sites, obstacles, anatomy, progress)
     surface, triangles = anatomy.outer_surface
-    found = ArmsEvaluation(
+    evaluation = ArmsEvaluation(
         points=sites.points,
         normals=sites.normals,
         inner=sites.inner,
@@ -129,14 +114,14 @@ def evaluate_arms(
     )
     if picture:
         try:
-            found = replace(found, picture=draw_arms(found, arms, where))
+            evaluation = replace(evaluation, picture=draw_arms(evaluation, arms, where))
         except NoGLError as error:
             progress.say(f"no picture: {error}")
-    return found
+    return evaluation
 
 
 def _sites(anatomy: Anatomy, ports: Ports, count: int, seed: int) -> Sites:
-    """Points of the surface, then the inner targets, whose normals point to the endoscope."""
+    """Points of the surface, then the inner targets with normals to the endoscope."""
     trocars = np.array([ports.left.point, ports.right.point])
     points, normals = facing_points(anatomy, trocars, count, seed)
     inner: FloatArray = np.array([target.point for target in ports.targets], dtype=np.float64).reshape(-1, 3)
@@ -153,8 +138,8 @@ def facing_points(anatomy: Anatomy, ports: ArrayLike, count: int, seed: int) -> 
     """Points on the organ's surface [m] and unit outward normals there, each (count, 3).
 
     A triangle faces the ports if the middle of the ports (n_port, 3) [m] lies on its outer side; anchored triangles are
-    left out. Triangles are quartered until there are many small ones; from their centroids each
-    next point is the one furthest from all before it (farthest-point sampling), the first drawn from the seed.
+    left out. Triangles are quartered until there are many small ones; their centroids are thinned by farthest-point
+    sampling, the first point drawn from the seed.
 
     Raises:
         ValueError: no triangle faces the ports.
@@ -200,7 +185,7 @@ class ArmSetup:
     """Two arms at their ports.
 
     Fields:
-        name, what: as a ranking shows them
+        name, what: of its row in a ranking
         left, right: descriptions of the arms
         ports: theirs and the endoscope's
     """
@@ -225,22 +210,22 @@ def run_study(
     """Evaluate the setups, rank them if there are several, and write report, points, heat maps and picture.
 
     Args:
-        setups: the one that is reported first, then those it is compared with.
+        setups: the reported one, then those of the comparison.
         anatomy: of the organ.
         folder: for the files.
         console: for progress and results.
-        points: number of points of the organ to be tried.
+        points: number of points of the organ.
         seed: of the points.
         command: the command line, for the report.
 
     Returns:
         The names of the files.
     """
-    found = []
+    evaluations = []
     with StepProgress(console) as progress:
         for setup in setups:
             progress.say(f"{setup.name}: {setup.what}")
-            found.append(
+            evaluations.append(
                 evaluate_arms(
                     anatomy,
                     setup.left,
@@ -252,92 +237,15 @@ def run_study(
                     picture=setup is setups[0],
                 )
             )
-        first = found[0]
+        first = evaluations[0]
         maps = ArmMaps(first).write_all(folder, progress)
-    ranking = rank([(s.name, s.what, one) for s, one in zip(setups, found, strict=True)]) if found[1:] else []
+    ranking = (
+        rank([(setup.name, setup.what, each) for setup, each in zip(setups, evaluations, strict=True)])
+        if evaluations[1:]
+        else []
+    )
     write_points(first, folder / POINTS_NAME)
     pictures = [] if first.picture is None else [write_picture(first.picture, folder / PICTURE_NAME)]
     write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
     console.print(verdict(first), highlight=False)
-    return [REPORT_NAME, POINTS_NAME, *(one.name for one in (*pictures, *maps))]
-
-
-def write_report(
-    evaluation: ArmsEvaluation,
-    path: Path,
-    *,
-    pictures: Sequence[Picture],
-    maps: Sequence[Picture],
-    command: str,
-    ranking: Sequence[Ranked] = (),
-) -> None:
-    """Write the report.
-
-    Args:
-        evaluation: what was found.
-        path: of the file.
-        pictures: of the arms in the patient.
-        maps: heat maps.
-        command: the command that makes this report.
-        ranking: of several placements or robots; left out if there is none.
-    """
-    page = render_page(
-        "arms.html.j2",
-        title=f"Two arms on {evaluation.scene}: {evaluation.left.name} (left) and {evaluation.right.name} (right)",
-        verdict=verdict(evaluation),
-        ranking=ranking,
-        ranking_rule=RANKING_RULE,
-        number_text=number_text,
-        pictures=pictures,
-        maps=maps,
-        has_targets=evaluation.inner.any(),
-        shares=_shares(evaluation),
-        values=_values(evaluation),
-        distances=[(title, *spread(getattr(evaluation, field)).texts(1e3, 1)) for field, title, _ in DISTANCES],
-        reasons=_reasons(evaluation),
-        cycle=cycle_section(evaluation),
-        definitions=_definitions(),
-        command=command,
-    )
-    path.write_text(page, encoding="utf-8", newline="\n")
-
-
-def _shares(evaluation: ArmsEvaluation) -> Rows:
-    """Shares of points that the left arm, the right arm and both at once reach."""
-    groups = [("on the surface", ~evaluation.inner), ("inside the organ", evaluation.inner)]
-    masks = [evaluation.left.reachable, evaluation.right.reachable, evaluation.both]
-    return [
-        (f"{name} ({int(group.sum())} points)", *(share_text(mask[group]) for mask in masks))
-        for name, group in groups
-        if group.any()
-    ]
-
-
-def _values(evaluation: ArmsEvaluation) -> list[tuple[str, list[tuple[str, str, str]]]]:
-    """Least, median and greatest of each quantity for each arm, and for the worse arm where both reach at once."""
-    rows = []
-    for quantity in QUANTITIES:
-        groups = [values_of(arm, quantity) for _, arm in sides(evaluation)]
-        groups.append(worse_of_both(evaluation, quantity))
-        rows.append((quantity.label, [spread(values).texts(quantity.scale, quantity.digits) for values in groups]))
-    return rows
-
-
-def _reasons(evaluation: ArmsEvaluation) -> Rows:
-    """Numbers and shares of points by their reason, for both arms."""
-    rows = []
-    for index, reason in enumerate(REASONS):
-        masks = [arm.reason == index for _, arm in sides(evaluation)]
-        rows.append((reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
-    return rows
-
-
-def _definitions() -> list[tuple[str, str]]:
-    """Names of all figures of an evaluation and what they mean."""
-    return [
-        ("reachable", SHARE_DEFINITIONS[0][1]),
-        ("both at once", SHARE_DEFINITIONS[1][1]),
-        *((quantity.label, quantity.definition) for quantity in QUANTITIES),
-        *((f"{title} [mm]", definition) for _, title, definition in DISTANCES),
-        ("the worse arm", "At a point, the smaller of both arms' values where more is better, else the larger."),
-    ]
+    return [REPORT_NAME, POINTS_NAME, *(drawing.name for drawing in (*pictures, *maps))]

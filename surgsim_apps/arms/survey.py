@@ -1,4 +1,4 @@
-"""A model file surveyed: which joints drive its tip, which parts are outer shapes, where a straight shaft is."""
+"""Survey of a model file: joints of its tip, outer shapes, straight shaft, remote centre."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,15 +10,8 @@ import numpy as np
 
 from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
 from msdm_core.mesh import FloatArray
-from surgsim_env.instruments import (
-    MESH_FORMATS,
-    faulty_links,
-    find_mesh,
-    mesh_names,
-    read_model,
-    read_xml,
-    speed_limits,
-)
+from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
+from surgsim_env.instruments import MESH_FORMATS, find_mesh, mesh_names, read_model, read_xml
 from surgsim_env.scene import LinkInertia, Vector, nearest
 
 # Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.
@@ -29,7 +22,7 @@ BARE_MASS = 0.01
 THICKNESS_LEAST = 0.002
 # A part is a straight shaft if it is this long and no thicker [m].
 SHAFT_LENGTH_LEAST, SHAFT_RADIUS_MOST = 0.10, 0.008
-# Axes that pass a point within this distance meet there [m].
+# Largest distance of axes from their meeting point [m].
 MEETING_TOLERANCE = 1e-4
 # Words in the names of frames at a tool's tip.
 TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
@@ -43,7 +36,7 @@ SPHERE, CAPSULE, CYLINDER, ELLIPSOID, BOX, MESH, PLANE, FIELD = (
 
 @dataclass(frozen=True)
 class Capsule:
-    """A capsule in a body's frame, or a ball where both ends are the same.
+    """A capsule in a body's frame, or a ball if both ends are the same.
 
     Fields:
         start, end: of its axis [m]                                                 (3,)
@@ -62,13 +55,13 @@ class Capsule:
 
 @dataclass(frozen=True)
 class RemoteCentre:
-    """A point through which a mechanism keeps its shaft.
+    """The point through which a mechanism keeps its shaft.
 
     Fields:
         point: in the model's own frame [m]                                         (3,)
-        body: that carries the shaft
+        body: of the shaft
         shaft_point, shaft_axis: in that body's frame [m], the axis towards the tip (3,)
-        joint: the slide that inserts the shaft
+        joint: the slide for inserting the shaft
     """
 
     point: FloatArray
@@ -79,13 +72,13 @@ class RemoteCentre:
 
 
 class ModelSurvey:
-    """What a model file contains, as compiled alone.
+    """Content of a model file, compiled alone.
 
     Fields:
         path: of the file
-        inertias: that were missing or wrong in a URDF and are made up from shapes
-        dropped_meshes: of a URDF that are not found or cannot be read
-        speed_limits: that a URDF states [rad/s or m/s]
+        inertias: made from shapes for those missing or wrong in a URDF
+        dropped_meshes: of a URDF, missing or unreadable
+        speed_limits: of a URDF [rad/s or m/s]
         model, data: of MuJoCo, at the model's initial joint values
     """
 
@@ -93,7 +86,7 @@ class ModelSurvey:
         """Read and compile a file.
 
         Raises:
-            ValueError: a file that is missing, no MJCF or URDF, or that MuJoCo refuses.
+            ValueError: a missing file, no MJCF or URDF, or a file that MuJoCo refuses.
         """
         self.path = path
         root = read_xml(path)
@@ -103,9 +96,9 @@ class ModelSurvey:
         self.speed_limits: dict[str, float] = {}
         if self.is_urdf:
             folder = (root.find("mujoco/compiler") or {}).get("meshdir", "")
-            found = {name: find_mesh(path, name, folder) for name in mesh_names(root)}
+            files = {name: find_mesh(path, name, folder) for name in mesh_names(root)}
             self.dropped_meshes = tuple(
-                name for name, file in found.items() if file is None or file.suffix.lower() not in MESH_FORMATS
+                name for name, file in files.items() if file is None or file.suffix.lower() not in MESH_FORMATS
             )
             self.speed_limits = speed_limits(root)
             faults = faulty_links(root)
@@ -123,7 +116,7 @@ class ModelSurvey:
         mujoco.mj_kinematics(self.model, self.data)
 
     def _solid_link(self, name: str, mass: float, centre: FloatArray) -> LinkInertia:
-        """Mass and moments of a solid block around a link's shapes, or of a ball where it has none."""
+        """Mass and moments of a solid block around a link's shapes, or of a cube for a link without one."""
         points = self.body_points(self.model.body(name).id)
         if len(points):
             size = np.maximum(np.ptp(points, axis=0), THICKNESS_LEAST)
@@ -143,12 +136,12 @@ class ModelSurvey:
         return self.model.body(body).name
 
     def parents(self, body: int) -> list[int]:
-        """A body and those that carry it, from the body to the world, which is left out."""
-        found = []
+        """A body and its ancestors, without the world."""
+        bodies = []
         while body:
-            found.append(body)
+            bodies.append(body)
             body = int(self.model.body_parentid[body])
-        return found
+        return bodies
 
     def body_joints(self, body: int) -> list[int]:
         """Joints of a body."""
@@ -156,7 +149,7 @@ class ModelSurvey:
         return list(range(first, first + count))
 
     def chain(self, body: int) -> list[int]:
-        """Joints that move a body, from the base.
+        """Joints from the base to a body.
 
         Raises:
             ValueError: there is none.
@@ -167,13 +160,13 @@ class ModelSurvey:
         return joints
 
     def find_tip(self, named: str | None) -> tuple[int, FloatArray | None]:
-        """The body of the tip and, of a frame that marks it, the tip's offset in that body [m] (3,).
+        """The body of the tip, and the tip's offset in that body [m] (3,) if a frame marks it.
 
-        Without a name it is a frame that is fixed to the last link of the longest chain of joints, or that link; where
-        a chain ends in several fingers, the link that carries them.
+        Without a name it is a frame fixed to the last link of the longest chain of joints, or that link; of a chain
+        that ends in several fingers, their common link.
 
         Raises:
-            ValueError: a name that is neither a body nor a site.
+            ValueError: a name of neither a body nor a site.
         """
         model = self.model
         sites = {model.site(index).name: index for index in range(model.nsite)}
@@ -237,7 +230,7 @@ class ModelSurvey:
     # ---- shapes ----------------------------------------------------------------------------------------------
 
     def geom_points(self, geom: int) -> FloatArray:
-        """Points whose hull contains a geom, in its body's frame [m], (n, 3); none of a plane."""
+        """Points with a geom in their hull, in its body's frame [m], (n, 3); none for a plane."""
         model, size = self.model, self.model.geom_size[geom]
         kind = model.geom_type[geom]
         if kind == MESH:
@@ -262,32 +255,32 @@ class ModelSurvey:
         return np.concatenate([np.zeros((0, 3)), *(self.geom_points(geom) for geom in self.body_geoms(body))])
 
     def round_geoms(self, body: int) -> list[int]:
-        """Geoms of a body that are spheres or capsules and have a name."""
+        """Named spheres and capsules of a body."""
         kinds = (SPHERE, CAPSULE)
         return [g for g in self.body_geoms(body) if self.model.geom_type[g] in kinds and self.model.geom(g).name]
 
     @cached_property
     def shaft(self) -> dict[int, Capsule]:
-        """The longest straight thin part of each body that has one, by body."""
-        found: dict[int, Capsule] = {}
+        """The longest straight thin part of a body, by body."""
+        shafts: dict[int, Capsule] = {}
         for body in range(1, self.model.nbody):
             fitted = [fit_capsule(points) for g in self.body_geoms(body) if len(points := self.geom_points(g))]
-            thin = [one for one in fitted if is_shaft(one)]
+            thin = [capsule for capsule in fitted if is_shaft(capsule)]
             if thin:
-                found[body] = max(thin, key=lambda one: one.length)
-        return found
+                shafts[body] = max(thin, key=lambda capsule: capsule.length)
+        return shafts
 
     # ---- remote centre ---------------------------------------------------------------------------------------
 
     def remote_centre(self, chain: Sequence[int], tip: int, offset: FloatArray) -> RemoteCentre | None:
-        """The point where the axes of the first hinges meet in all poses and through which a slide moves the shaft."""
+        """The common point of the first hinges' axes in all poses, on the line of the shaft's slide."""
         model = self.model
         slides = [index for index, joint in enumerate(chain) if model.jnt_type[joint] == SLIDE]
         if not slides or slides[0] < 2 or not model.jnt_limited[chain[slides[0]]]:
             return None
         before, slide = chain[: slides[0]], chain[slides[0]]
         body = int(model.jnt_bodyid[slide])
-        rng, found = np.random.default_rng(0), []
+        rng, poses = np.random.default_rng(0), []
         for _ in range(3):
             ranges = np.array([self.range_of(joint, np.pi) for joint in chain])
             self.place(chain, ranges[:, 0] + rng.random(len(chain)) * np.ptp(ranges, axis=1))
@@ -297,11 +290,11 @@ class ModelSurvey:
             body = self._shaft_body(chain, slides[0])
             rotation = self.data.xmat[body].reshape(3, 3)
             axis = matmul(rotation.T, self.data.xaxis[slide])
-            # The point of the line that is nearest to the body's origin, which the insertion does not move.
+            # The line's point nearest to the body's origin; the insertion does not move it.
             local = matmul(rotation.T, point - self.data.xpos[body])
-            found.append((point, local - matmul(local, axis) * axis, axis))
-        first = found[0]
-        if any(np.abs(np.array(one) - np.array(first)).max() > MEETING_TOLERANCE for one in found):
+            poses.append((point, local - matmul(local, axis) * axis, axis))
+        first = poses[0]
+        if any(np.abs(np.array(pose) - np.array(first)).max() > MEETING_TOLERANCE for pose in poses):
             return None
         point, local, axis = first
         low, high = self.range_of(slide, 0.0)
@@ -315,7 +308,7 @@ class ModelSurvey:
         return RemoteCentre(point, body, local, sign * axis, slide)
 
     def _shaft_body(self, chain: Sequence[int], slide: int) -> int:
-        """The last body that only turns about the line along which a slide moves, as the data are posed."""
+        """The last body with no motion but turning about the line of a slide, in the current pose."""
         body = int(self.model.jnt_bodyid[chain[slide]])
         axis = self.data.xaxis[chain[slide]]
         line = self.data.xanchor[chain[slide + 1]] if slide + 1 < len(chain) else None
@@ -329,7 +322,7 @@ class ModelSurvey:
 
 
 def meeting_point(points: FloatArray, axes: FloatArray) -> FloatArray | None:
-    """The point (3,) that lines with points and unit axes (n, 3) have in common; None if there is no single one."""
+    """The common point (3,) of lines with points and unit axes (n, 3); None if there is no single one."""
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     total = across.sum(axis=0)
     if eigh(total)[0][0] < 1e-3:
@@ -340,7 +333,7 @@ def meeting_point(points: FloatArray, axes: FloatArray) -> FloatArray | None:
 
 
 def fit_capsule(points: FloatArray) -> Capsule:
-    """A capsule along the longest principal axis of points (n, 3) that contains them."""
+    """A capsule around points (n, 3), along their longest principal axis."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     around = points - middle
     axis = eigh(matmul(around.T, around))[1][:, -1]
@@ -359,13 +352,13 @@ def fit_capsule(points: FloatArray) -> Capsule:
 
 
 def is_shaft(capsule: Capsule) -> bool:
-    """Whether a capsule is long and thin enough for a laparoscopic instrument's shaft."""
+    """True if a capsule is long and thin enough for a laparoscopic instrument's shaft."""
     return capsule.length >= SHAFT_LENGTH_LEAST and capsule.radius <= SHAFT_RADIUS_MOST
 
 
 def vector(values: FloatArray, digits: int | None = 9) -> Vector:
     """Three numbers as a tuple, rounded to a number of decimals, without -0."""
-    x, y, z = (float(one) if digits is None else round(float(one), digits) + 0.0 for one in values)
+    x, y, z = (float(value) if digits is None else round(float(value), digits) + 0.0 for value in values)
     return x, y, z
 
 

@@ -1,13 +1,12 @@
-"""Two arms on a patient who breathes: reach, paths and clearance through the cycle, and the report's tables.
+"""Two arms on a breathing patient: reach, paths and clearance through the cycle.
 
-The organ goes with its ground, as at slow motion: its points and surface are displaced, its normals are not turned.
-Ports, body wall and endoscope stay.
+The organ follows its ground quasistatically: its points and surface are displaced, its normals are not turned. Ports,
+body wall and endoscope stay.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,31 +25,26 @@ from surgsim_apps.arms.reach import (
     pair_distances,
     ways,
 )
-from surgsim_apps.arms.results import (
-    ArmsEvaluation,
-    ArmThroughCycle,
-    ThroughCycle,
-    number_text,
-)
+from surgsim_apps.arms.results import ArmThroughCycle, ThroughCycle
 from surgsim_env.scene import Anatomy, CyclicMotion
 from surgsim_env.step_progress import StepProgress
 
-# Evenly spaced positions between rest and top of the motion that moves the organ most.
+# Evenly spaced positions between rest and top of the organ's largest motion.
 STEPS = 5
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """Positions of an organ that are evaluated: each motion in its largest cycle.
+    """Evaluated positions of an organ, each motion in its largest cycle.
 
-    From rest to the top of the motion that moves the organ most in even steps, the others at rest; then, if there are
-    others, rest and top again with all others at their tops.
+    From rest to the top of the organ's largest motion in even steps, the others at rest; then, if there are others,
+    rest and top again with all others at their tops.
 
     Fields:
         motions: of the scene
-        main: index of the motion that moves the organ most
+        main: index of the organ's largest motion
         level: share of each motion's top at each position                   (n_position, n_motion)
-        before: the position from which an arm comes to each; the first has none
+        before: the arm's previous position of each; the first has none
     """
 
     motions: tuple[CyclicMotion, ...]
@@ -61,12 +55,12 @@ class Cycle:
     @property
     def signals(self) -> FloatArray:
         """Signals of the motions at each position, (n_position, n_motion)."""
-        return self.level * np.array([one.size[1] for one in self.motions])
+        return self.level * np.array([motion.size[1] for motion in self.motions])
 
 
 def make_cycle(motions: Sequence[CyclicMotion]) -> Cycle:
     """The positions of an organ with at least one motion."""
-    main = int(np.argmax([math.hypot(*one.displacement) * one.size[1] for one in motions]))
+    main = int(np.argmax([math.hypot(*motion.displacement) * motion.size[1] for motion in motions]))
     alone = np.arange(len(motions)) == main
     level = np.linspace(0.0, 1.0, STEPS + 1)[:, None] * alone
     before = [max(number - 1, 0) for number in range(STEPS + 1)]
@@ -88,7 +82,7 @@ def evaluate_cycle(
 
     Args:
         arms: reach of each with the organ at rest.
-        both: what both reach at once then.
+        both: reach of both at once then.
         sites: the points at rest.
         around: obstacles of each arm at rest.
         anatomy: of the scene.
@@ -96,36 +90,36 @@ def evaluate_cycle(
     """
     cycle, mesh = make_cycle(anatomy.scene.motions), anatomy.mesh
     shifts, nodes = (
-        np.stack([one.shift(places) for one in anatomy.ground_motions]) for places in (sites.points, mesh.points)
+        np.stack([motion.shift(rest) for motion in anatomy.ground_motions]) for rest in (sites.points, mesh.points)
     )
     count = len(cycle.signals)
     places, organs = [sites], [around[0].organ]
-    reachable, together = [[one.report.reachable] for one in arms], [both]
+    reachable, together = [[arm.report.reachable] for arm in arms], [both]
     with progress.step("both arms through the cycle", 2 * count) as advance:
         for number in range(1, count):
             signal = cycle.signals[number]
             places.append(replace(sites, points=sites.points + np.einsum("m,mni->ni", signal, shifts)))
             moved_nodes = mesh.points + np.einsum("m,mni->ni", signal, nodes)
             organs.append(ClusteredSurface(moved_nodes, mesh.boundary_triangles))
-            found = []
+            reaches = []
             for arm, obstacles, rows in zip(arms, around, reachable, strict=True):
-                found.append(evaluate_reach(arm.kinematics, places[-1], replace(obstacles, organ=organs[-1])))
-                rows.append(found[-1].report.reachable)
+                reaches.append(evaluate_reach(arm.kinematics, places[-1], replace(obstacles, organ=organs[-1])))
+                rows.append(reaches[-1].report.reachable)
                 advance(1)
-            together.append(evaluate_both(found[0], found[1], places[-1].points))
+            together.append(evaluate_both(reaches[0], reaches[1], places[-1].points))
         followed = []
         for arm, obstacles, rows in zip(arms, around, reachable, strict=True):
             moved = [replace(obstacles, organ=organ) for organ in organs]
             followed.append(_followed(arm, cycle, places, moved, np.stack(rows)))
             advance(1)
     kinematics = arms[0].kinematics, arms[1].kinematics
-    moved = [tuple(replace(one, organ=organ) for one in around) for organ in organs]
+    moved = [tuple(replace(obstacles, organ=organ) for obstacles in around) for organ in organs]
     order = [cycle.main, *(m for m in range(len(cycle.motions)) if m != cycle.main)]
     motions = [cycle.motions[number] for number in order]
     return ThroughCycle(
-        motions=tuple(one.name for one in motions),
+        motions=tuple(motion.name for motion in motions),
         travel=np.array([cycle.motions[m].size[1] * np.linalg.norm(nodes[m], axis=1).max() for m in order]),
-        period=np.array([one.period[0] for one in motions]),
+        period=np.array([motion.period[0] for motion in motions]),
         left=followed[0],
         right=followed[1],
         both=_together(kinematics, cycle, places, moved, together),
@@ -139,7 +133,7 @@ def _followed(
     around: Sequence[Obstacles],
     reachable: NDArray[np.bool_],
 ) -> ArmThroughCycle:
-    """An arm along paths that begin at the reported joints, or where these end at an obstacle at other candidates."""
+    """An arm along paths from the reported joints, or from other candidates if these meet an obstacle."""
     kinematics, n_point = arm.kinematics, reachable.shape[1]
     paths = np.full((len(places), n_point, kinematics.arm.joint_count), np.nan)
     rows = np.flatnonzero(arm.report.reachable)
@@ -169,9 +163,9 @@ def _path(
     rows: NDArray[np.integer],
     start: FloatArray,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Joints of some points (rows) from position to position (n_position, n, n_joint), and which keep all rules (n,).
+    """Paths of some points (rows) in joint space (n_position, n, n_joint), and a mask of those within all rules (n,).
 
-    Each position begins at the joints of the one before: the search changes them as little as it needs.
+    Each position begins at the joints of the previous one: the search changes them as little as it needs.
     """
     path, kept = np.zeros((len(places), *start.shape)), np.ones(len(rows), dtype=bool)
     path[0] = start
@@ -184,11 +178,11 @@ def _path(
 def _next(
     kinematics: BatchKinematics, sites: Sites, around: Obstacles, rows: NDArray[np.integer], joints: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Joints (n, n_joint) changed to follow some points (rows) to a position, and which keep all rules there (n,)."""
-    found = search_joints(kinematics, Wanted(sites.tips(around.ball)[rows]), joints)
-    chain = kinematics.at(found.joints)
+    """Joints (n, n_joint) that follow some points (rows) to a position, and a mask of those within all rules (n,)."""
+    candidates = search_joints(kinematics, Wanted(sites.tips(around.ball)[rows]), joints)
+    chain = kinematics.at(candidates.joints)
     clear = sites.inner[rows] | (around.organ_clearance(kinematics, chain, exact=False) >= 0.0)
-    return found.joints, found.met & clear & (around.wall_clearance(kinematics, chain) >= 0.0)
+    return candidates.joints, candidates.met & clear & (around.wall_clearance(kinematics, chain) >= 0.0)
 
 
 def _together(
@@ -196,15 +190,15 @@ def _together(
     cycle: Cycle,
     places: Sequence[Sites],
     around: Sequence[tuple[Obstacles, ...]],
-    found: Sequence[BothArms],
+    together: Sequence[BothArms],
 ) -> NDArray[np.bool_]:
-    """Which points both reach at once at each position, (n_position, n).
+    """Mask of points in reach of both at once at each position, (n_position, n).
 
-    The search at a position tries few pairs of candidates. Where it finds none, that of the position before it, or
-    after it, is followed here. At rest it is as found.
+    The search at a position tries few pairs of candidates. If it fails, the pair of the previous or the next position
+    is followed here. The result at rest stays.
     """
-    both = np.stack([one.reachable for one in found])
-    pairs = [(one.joints[0].copy(), one.joints[1].copy()) for one in found]
+    both = np.stack([result.reachable for result in together])
+    pairs = [(result.joints[0].copy(), result.joints[1].copy()) for result in together]
     ahead = list(enumerate(cycle.before))[1:]
     back = [(before, number) for number, before in reversed(ahead) if before]
     for to, start in [*ahead, *back]:
@@ -212,8 +206,8 @@ def _together(
         if not rows.size:
             continue
         (left, left_good), (right, right_good) = (
-            _next(arm, places[to], one, rows, joints[rows])
-            for arm, one, joints in zip(kinematics, around[to], pairs[start], strict=True)
+            _next(arm, places[to], obstacles, rows, joints[rows])
+            for arm, obstacles, joints in zip(kinematics, around[to], pairs[start], strict=True)
         )
         gaps = np.minimum(*pair_distances(kinematics, (left, right), places[to].points[rows]))
         good = left_good & right_good & (gaps >= ARM_DISTANCE)
@@ -221,62 +215,3 @@ def _together(
         for joints, changed in zip(pairs[to], (left, right), strict=True):
             joints[rows[good]] = changed[good]
     return both
-
-
-def _worst_and_median(values: FloatArray) -> dict[str, float]:
-    """The least of all points and positions; the median over the points of each one's least, and of its median."""
-    known = values[:, np.isfinite(values).all(axis=0)]
-    if not known.size:
-        return dict.fromkeys(("worst", "median_of_worst", "median"), math.nan)
-    each = known.min(axis=0)
-    return {
-        "worst": float(each.min()),
-        "median_of_worst": float(np.median(each)),
-        "median": float(np.median(np.median(known, axis=0))),
-    }
-
-
-def cycle_section(evaluation: ArmsEvaluation) -> dict[str, Any] | None:
-    """Contents of the report's section on the cycle; None for a patient who holds still."""
-    cycle, outer = evaluation.cycle, ~evaluation.inner
-    if cycle is None:
-        return None
-    parts = [
-        f"{name} by up to {_millimetres(travel)} in cycles of {period:.2g} s"
-        for name, travel, period in zip(cycle.motions, cycle.travel, cycle.period, strict=True)
-    ]
-    return {
-        "motions": ", ".join(parts),
-        "positions": len(cycle.both),
-        "reach": _reach_rows(cycle, outer),
-        "clearance": _clearance_rows(cycle, outer),
-    }
-
-
-def _reach_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
-    """Shares of points at rest, median and least over the positions, at every position, and with a path."""
-    rows = [(f"{side} arm", arm.reachable, _per_cent(float(arm.has_path[outer].mean()))) for side, arm in cycle.arms]
-    rows.append(("both at once", cycle.both, ""))
-    texts = []
-    for name, reachable, path in rows:
-        each = reachable[:, outer]
-        share = each.mean(axis=1)
-        figures = (share[0], float(np.median(share)), float(share.min()), float(each.all(axis=0).mean()))
-        texts.append((name, *map(_per_cent, figures), path))
-    return texts
-
-
-def _clearance_rows(cycle: ThroughCycle, outer: NDArray[np.bool_]) -> list[tuple[str, ...]]:
-    rows = []
-    for side, arm in cycle.arms:
-        found = _worst_and_median(arm.clearance[:, outer])
-        rows.append((f"{side} arm: clearance [mm]", *(number_text(one, 1e3, 2) for one in found.values())))
-    return rows
-
-
-def _millimetres(value: float) -> str:
-    return number_text(value, 1e3, 1, "mm")
-
-
-def _per_cent(share: float) -> str:
-    return number_text(share, 100.0, 0, "%")

@@ -18,11 +18,10 @@ SCENE = "phantom"
 ENV_ID = "SurgSim/Palpate-v0"
 # Control steps before the clock starts: at 20 mm/s the tip is on the tissue by then, from up to 6 mm above it.
 WARM_UP = 9
-METHOD = f"""Control steps of all environments together per second of wall clock, `{ENV_ID}` on `{SCENE}`, each
-environment with its own lesion and place. A policy presses until it feels 0.1 N and then moves to and fro, so that
-nearly every haptic step is in contact; times include resets at the ends of episodes. "processes" is AsyncVectorEnv, one
-process per environment; "in turn" SyncVectorEnv, one core; "abreast" `vectorization_mode="vector_entry_point"`, 8
-organs per group in float64, 16 in float32, one thread per group; {{cores}} cores here."""
+METHOD = f"""Control steps of all environments together per second of wall clock, `{ENV_ID}` on `{SCENE}`, nearly
+always in contact, resets included. "processes" is AsyncVectorEnv, one process per environment; "in turn"
+SyncVectorEnv, one core; "abreast" `vectorization_mode="vector_entry_point"`, 8 organs per group in float64, 16 in
+float32, one thread per group; {{cores}} cores here."""
 
 
 def make_env() -> gym.Env:

@@ -12,10 +12,9 @@ from surgsim_env.scene import load_anatomy, make_scene
 SPEED = 0.04  # [m/s]
 # Haptic steps held at depth after each press.
 HOLD_COUNT = 100
-METHOD = """Wall clock of each haptic step (instrument, contact, substeps, exchange) in contact, while the scene's tip
-presses the scene's organ with its lesions at random places, to the scene's depth, and rests there. The worst step
-includes interruptions by other processes; `processor` is processor time, which other processes hardly change. Real
-time is the scene's haptic step of 1000 us."""
+METHOD = """Wall clock of each haptic step in contact, while the scene's tip presses the scene's organ with its lesions
+at random places, to the scene's depth, and rests there. The worst step includes interruptions by other processes;
+`processor` is processor time. Real time is the scene's haptic step of 1000 us."""
 
 
 def measure(effort: Effort) -> Section:

@@ -18,8 +18,7 @@ PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton
 REPORT_NAME = "benchmarks.md"
 INTRODUCTION = """# Benchmarks
 
-Written by `surgsim bench{quick}`. Times hold for this machine and this run; compare the ratios. No test asserts any of
-them.
+Written by `surgsim bench{quick}`. Times hold for this machine and this run; compare the ratios.
 """
 
 
@@ -111,7 +110,8 @@ class Section:
             by_column = {(figure.quantity, figure.unit): figure.text for figure in own}
             texts = [case, *(by_column.get(column, "") for column in columns)]
             if noted:
-                texts.append("; ".join(dict.fromkeys(figure.note for figure in own if figure.note)))
+                parts = [part for figure in own if figure.note for part in figure.note.split("; ")]
+                texts.append("; ".join(dict.fromkeys(parts)))
             lines.append("| " + " | ".join(text.replace("|", "\\|") for text in texts) + " |")
         return "\n".join(lines) + (f"\n\n{self.closing}" if self.closing else "") + "\n"
 

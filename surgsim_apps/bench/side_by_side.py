@@ -15,16 +15,14 @@ SHARE = 0.02
 # A round that takes longer than this [s] is not repeated.
 LONGEST_ROUND = 60.0
 NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that is stable in the press is used
-METHOD = """One press of a frictionless ball of 8 mm radius, 4 mm deep at 40 mm/s, then 0.1 s of rest, on a block of
-60 x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
-round. `wall` and `processor` are seconds of wall clock and of processor time per simulated second (1 is real time),
-medians; they differ where other processes took the core. `ratio` is processor time relative to surgsim. A round that
-takes more than a minute is not repeated. Force is the mean of two places, over a node in the block's middle and half a
-cell to the side; `error` is relative to axisymmetric quadratic finite elements with small strains:
-{references}. surgsim presses with its own contact
-law (friction 0.2, which hardly affects a straight press) and its instrument in MuJoCo, and reads the force in every
-haptic step; the force of the other simulators is read once, at the end. They have nodes on a cubic or nearly cubic
-grid, surgsim on a body-centred lattice: numbers of nodes are similar, positions differ."""
+METHOD = """One press of a frictionless ball of 8 mm radius, 4 mm deep at 40 mm/s, then 0.1 s of rest, on a block of 60
+x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
+round. `wall` and `processor` are seconds per simulated second (1 is real time), medians; `ratio` is processor time
+relative to surgsim. A round that takes more than a minute is not repeated. Force is the mean of two places, over a
+node in the block's middle and half a cell to the side; `error` is relative to axisymmetric quadratic finite elements
+with small strains: {references}. surgsim has friction 0.2, which hardly affects a straight press, and its instrument
+in MuJoCo, and reads the force in every haptic step, the others once, at the end. They have nodes on a cubic or nearly
+cubic grid, surgsim on a body-centred lattice: numbers of nodes are similar, positions differ."""
 WALL, PROCESSOR, RATIO = ("wall", "s/s"), ("processor", "s/s"), ("ratio to surgsim", "1")
 FORCE, ERROR = ("force", "N"), ("error", "%")
 
@@ -126,7 +124,7 @@ def _figures(tally: Tally, own: Tally) -> list[Figure]:
 
 
 # From running the two that are measured (mujoco 4.0.0, newton 1.8.0), from the others' repositories and threads.
-LIMITS = """### What each provides
+LIMITS = """### Features
 
 | simulator | moduli per region | tool force in newtons | Gymnasium environment of a soft organ | source |
 |---|---|---|---|---|
@@ -143,4 +141,4 @@ ScheiklP/sofa_env 85bf7e0 |
 | PyBullet soft bodies | one a body | no: the normal force is always 1 | no | bullet3 #4406, #3326, #4333 |
 | FF-SRL | one a mesh | no | no, two demonstrations | SanoScience/FF-SRL 1036742 |
 
-Only the first four were run here; the others are described from their code and threads, and may have changed since."""
+Only the first four were run here; the others are described from their code and threads."""

@@ -13,9 +13,9 @@ from surgsim_apps.bench.report import Figure, Section, absent
 SCENE = "phantom"
 # A process that hangs is stopped after this time [s].
 LIMIT = 600.0
-METHOD = f"""A fresh interpreter from its first import to the end of the first `step` of `SurgSim/Palpate-v0` on
-`{SCENE}`; cold is with an empty numba cache, warm with a full one; reset is the median of seven, each with another
-lesion. Memory is the growth of the process (resident set) per environment made and reset after the first two."""
+METHOD = f"""Start is from the first import to the end of the first `step` of `SurgSim/Palpate-v0` on `{SCENE}`; cold
+is with an empty numba cache, warm with a full one; reset is the median of seven. Memory is the growth of the process
+(resident set) per environment made and reset after the first two."""
 START = f"""
 import time; begin = time.perf_counter()
 import gymnasium as gym

@@ -20,9 +20,8 @@ CELL = 0.005  # [m]
 # The exponent is that of blocks with at least this number of nodes: in smaller ones calls and start-up dominate.
 LEAST_NODES = 600
 METHOD = """Blocks of cubic 5 mm cells, E 5 kPa, nu 0.45, springs and volume term, no contact, one thread, bottom held,
-slightly sheared so that no force is zero. Microseconds of processor time per substep and organ; medians, all sizes in
-turn in each round. "Abreast" are organs side by side in lanes. A node or spring update is one node or spring in one
-substep."""
+slightly sheared. Processor time per substep and organ; medians, all sizes in turn in each round. "Abreast" are organs
+side by side in lanes (vectorised). A node or spring update is one node or spring in one substep."""
 
 # The block of phantom's size whose springs stiffen and relax, and how it is timed: Maxwell arms give way once a
 # millisecond, so that all laws need the same step.
@@ -39,10 +38,10 @@ LAWS = {
     "relaxation": replace(TISSUE, relaxation=ARMS),
     "both": replace(TISSUE, stiffening=STIFFENING, relaxation=ARMS),
 }
-LAW_METHOD = """One block of 2047 nodes as above, with the laws of tissue: stiffening from a strain of 0.05 to 0.2 up to
-20 times the tangent, three Maxwell arms. Sheared anew after every 16 substeps: by 0.03, where no spring is steep, or
-by 0.1, where springs of many nodes are, and are integrated implicitly. The same step of 0.25 ms for all, processor time
-per substep and organ, all laws in turn in each round. Ratios are to linear, elastic springs at the same shear."""
+LAW_METHOD = """One block of 2047 nodes as above: stiffening from a strain of 0.05 to 0.2 up to 20 times the tangent,
+three Maxwell arms. Sheared anew after every 16 substeps: by 0.03, with no steep spring, or by 0.1, with steep springs
+at many nodes, which are integrated implicitly. The same step of 0.25 ms for all. Ratios are to linear, elastic springs
+at the same shear."""
 
 Substep = Callable[[], float]
 

@@ -16,11 +16,10 @@ from surgsim_env.rendering import NoGLError
 LANES = 16
 # Of PPO: steps of each environment between updates are the effort's.
 BATCH_SIZE, EPOCHS = 512, 4
-METHOD = f"""Control steps of {LANES} environments together per second, side by side in float32, {{cores}} cores.
-"Stepping" is with random actions; "PPO" is stable-baselines3's with its updates: {{steps}} steps of each environment,
-then {EPOCHS} epochs of minibatches of {BATCH_SIZE}; two layers of 128 for policy and value, and for pictures the three
-convolutions of Mnih et al. (2015) before them. Per second of wall clock, and of processor time, all threads together;
-medians. Resets at the ends of episodes are included."""
+METHOD = f"""Control steps of {LANES} environments together per second, vectorised in float32, {{cores}} cores, resets
+included; medians, per second of wall clock and of processor time of all threads. "Stepping" is with random actions;
+"PPO" is stable-baselines3's with its updates: {{steps}} steps of each environment, then {EPOCHS} epochs of minibatches
+of {BATCH_SIZE}; two layers of 128, and for pictures the three convolutions of Mnih et al. (2015) before them."""
 WALL, PROCESSOR = "wall", "processor"
 
 

@@ -1,4 +1,4 @@
-"""`surgsim arm check`: a palpating arm made from an MJCF or URDF file, with its TOML file and a picture."""
+"""`surgsim arm check`: a palpating arm from an MJCF or URDF file, with its TOML file and a picture."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from surgsim_env.step_progress import StepProgress
 if TYPE_CHECKING:
     from surgsim_env.instruments import Arm as ArmKinematics
 
-# Below this share of the places around home that the tip reaches, the arm is not useful as it is.
+# Least share of the places around home in reach of a useful arm's tip.
 REACH_LEAST = 0.5
-# Comments on the entries of the file that is written.
+# Comments on the entries of the written file.
 COMMENTS = {
     "model": "MJCF or URDF file, relative to this file",
     "kind": '"palpator" or "grasper"',
@@ -68,27 +68,27 @@ class Arm:
     """Make a palpating arm from an MJCF or URDF file: `surgsim arm check FILE`.
 
     Finds the chain of joints, the tip, the shaft, a trocar and a home; finds meshes, replaces missing inertias, adds
-    shapes that tissue feels. Writes NAME.toml, with a comment on every entry, and NAME.png. See docs/arms.md.
+    contact shapes. Writes NAME.toml, with a comment on every entry, and NAME.png. See docs/arms.md.
     """
 
     action: tyro.conf.Positional[Literal["check"]]
-    """What to do."""
+    """The action."""
     file: tyro.conf.Positional[Path]
     """MJCF or URDF file of the arm."""
     tip: MaybeText = None
-    """Link or site of the tip, or that carries the tool; default: the end of the longest chain of joints."""
+    """Link or site of the tip, or of the tool's mount; default: the end of the longest chain of joints."""
     trocar: MaybeText = None
     """Trocar x,y,z in the model's own frame [m]; default: the remote centre, else chosen together with home."""
     tool: MaybeNumber = None
-    """Mount a straight palpator of this length [m], whatever the model has; default: 0.4 on arms without a shaft."""
+    """Mount a straight palpator of this length [m], even beside a shaft; default: 0.4 on arms without a shaft."""
     out: MaybePath = None
     """Folder for the results; default: that of the file."""
 
     def run(self, console: Console) -> int:
-        """Make the arm, print what was found and chosen, write its TOML file and a picture; 1 if it reaches little.
+        """Make the arm, print findings and choices, write its TOML file and a picture; 1 if it reaches little.
 
         Raises:
-            ValueError: a file that is no arm, or an option that is not possible.
+            ValueError: a file without an arm, or an impossible option.
         """
         from surgsim_apps.arms.find_arm import find_arm
         from surgsim_env.instruments import load_arm
@@ -103,32 +103,32 @@ class Arm:
         if (folder / names[0]).exists():
             raise ValueError(f"{folder / names[0]} is there already: remove it, or give another --out")
         with StepProgress(console) as progress, progress.step("looking for a home"):
-            found = find_arm(
+            arm_model = find_arm(
                 self.file,
                 tip=self.tip,
                 trocar=vector_of("--trocar", self.trocar),
                 tool_length=self.tool,
             )
-        for sentence in found.found:
+        for sentence in arm_model.found:
             console.print(f"found: {sentence}", highlight=False, soft_wrap=True)
-        for sentence in found.chosen:
+        for sentence in arm_model.chosen:
             console.print(f"warning: {sentence}", highlight=False, soft_wrap=True, style="yellow")
         model = os.path.relpath(self.file.resolve(), folder.resolve())
-        description = replace(found.description, model=Path(model).as_posix())
+        description = replace(arm_model.description, model=Path(model).as_posix())
         head = (
             f"Written by `surgsim arm check` from {self.file.name}; docs/arms.md explains every entry.",
-            *(f"Found: {sentence}." for sentence in found.found),
-            *(f"Chosen: {sentence}." for sentence in found.chosen),
+            *(f"Found: {sentence}." for sentence in arm_model.found),
+            *(f"Chosen: {sentence}." for sentence in arm_model.chosen),
         )
-        arm = load_arm(found.description)
+        arm = load_arm(arm_model.description)
         with output_folder(folder, names) as files:
             (files / names[0]).write_text(arm_toml(description, head=head, comments=COMMENTS), encoding="utf-8")
             drawn = _draw(arm, files / names[1], console)
         written = names if drawn else names[:1]
         console.print(f"written: {folder}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
-        if found.reach < REACH_LEAST:
+        if arm_model.reach < REACH_LEAST:
             console.print(
-                f"the tip reaches {found.reach:.0%} of the places around home: name another --trocar or --tip",
+                f"the tip reaches {arm_model.reach:.0%} of the places around home: name another --trocar or --tip",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -142,7 +142,7 @@ class Arm:
 
 
 def _draw(arm: ArmKinematics, path: Path, console: Console) -> bool:
-    """Write a picture of an arm at home; without OpenGL say why there is none."""
+    """Write a picture of an arm at home; False, with a message, without OpenGL."""
     from matplotlib.image import imsave
 
     from surgsim_apps.arms.arm_picture import draw_arm

@@ -21,7 +21,7 @@ from surgsim_env.scene import (
 )
 
 FEWEST_POINTS = 10
-# A file of --compare with one of these tables is a ports file, any other an arm.
+# Tables of a ports file; any other file of --compare is an arm.
 PORT_TABLES = {"left", "right", "endoscope"}
 
 
@@ -38,24 +38,24 @@ class Arms:
     """The right arm, likewise."""
     ports: Path | None = None
     """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; default:
-    ports as in laparoscopy (docs/evaluation.md)."""
+    ports as in laparoscopy (docs/arms_report.md)."""
     scene: str = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     compare: tuple[str, ...] = ()
-    """Other ports files, or arms for both sides, to be ranked in one table."""
+    """Other ports files, or arms for both sides, for a ranking."""
     points: int = 500
-    """Number of points of the organ to be tried."""
+    """Number of points of the organ."""
     seed: int = 0
     """Seed of the points."""
     motion: str | None = None
-    """How the patient breathes: none, calm or free; by default as the scene says. Adds reach, paths and clearance
-    through the cycle to the report."""
+    """Breathing of the patient: none, calm or free; default: the scene's. Adds reach, paths and clearance through the
+    cycle to the report."""
     out: Path = Path("runs/arms")
     """Folder for the results."""
 
     @property
     def command_line(self) -> str:
-        """The command that makes the same report, without --out; files outside the working folder by name alone."""
+        """The command for the same report, without --out; files outside the working folder by name alone."""
         words = ["surgsim", "arms", "--scene", _shown(self.scene), "--left", _shown(self.left)]
         words += ["--right", _shown(self.right)]
         if self.ports is not None:
@@ -71,7 +71,7 @@ class Arms:
         """Evaluate and write report.html, points.csv, the heat maps and a picture of the arms.
 
         Raises:
-            ValueError: one line about an option that is not possible.
+            ValueError: an impossible option, in one line.
         """
         for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
             if getattr(self, name) < least:
@@ -87,19 +87,19 @@ class Arms:
 
 
 def _setup(command: Arms, anatomy: Anatomy, compared: str | None) -> ArmSetup:
-    """The arms at their ports as given, or with a file of --compare: at its ports, or its arm on both sides."""
-    given = "default ports" if command.ports is None else command.ports.name
+    """The arms at their ports, or with a file of --compare: at its ports, or its arm on both sides."""
+    own = "default ports" if command.ports is None else command.ports.name
     left, right, ports = _read("--left", command.left), _read("--right", command.right), command.ports
     if compared is None:
-        name, what = given, f"{left.name} left, {right.name} right, as given"
+        name, what = own, f"{left.name} left, {right.name} right, as given"
     elif _is_ports_file(compared):
         name, what = Path(compared).name, f"ports, with {left.name} left, {right.name} right"
         ports = Path(compared)
     else:
-        name, what = Path(compared).name, f"arm on both sides, at the ports of {given}"
+        name, what = Path(compared).name, f"arm on both sides, at the ports of {own}"
         left = right = _read("--compare", compared)
     placed, radius = _checked_ports(ports, anatomy), anatomy.scene.instrument.tip_radius
-    # A model that is wrong is refused before the first evaluation, which takes a minute.
+    # A wrong model is refused before the first evaluation, which takes a minute.
     for description, place in ((left, placed.left), (right, placed.right)):
         load_arm(description, place.port, tip_radius=radius)
     return ArmSetup(name, what, left, right, placed)
@@ -128,7 +128,7 @@ def _checked_ports(path: Path | None, anatomy: Anatomy) -> Ports:
 
 
 def _shown(source: str | Path) -> str:
-    """A path that does not depend on the machine: relative to the working folder, or its name alone."""
+    """A path independent of the machine: relative to the working folder, or its name alone."""
     path = Path(source)
     if not path.is_absolute():
         return path.as_posix()

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bench:
-    """Time the tissue, the environments and the start, beside MuJoCo flex and Newton; print and write the figures.
+    """Time the tissue, the environments and the start, beside MuJoCo flex and Newton.
 
-    Prints the tables and writes them to benchmarks.md. Simulators that are not installed are listed as absent.
+    Prints the tables and writes them to benchmarks.md. Simulators without an installation are listed as absent.
     """
 
     quick: bool = False
@@ -30,7 +30,7 @@ class Bench:
         """Measure every part, print its figures at once, write the report; returns 0, also if peers are absent.
 
         Raises:
-            OSError: the folder cannot be written (checked before the work).
+            OSError: a read-only folder (checked before the work).
         """
         from surgsim_apps.bench import measurement, report
 
@@ -49,7 +49,7 @@ class Bench:
 
 
 def measured_parts() -> "tuple[Callable[[Effort], Section], ...]":
-    """What measures each section, in the order of the report."""
+    """Measurements of the sections, in the order of the report."""
     from surgsim_apps.bench import control, haptic, side_by_side, start, substeps, training
 
     return (

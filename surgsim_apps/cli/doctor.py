@@ -1,4 +1,4 @@
-"""`surgsim doctor`: what this installation runs on, whether it works, and what is missing for which feature."""
+"""`surgsim doctor`: platform of this installation, a self-test, and missing packages by feature."""
 
 import os
 import platform
@@ -22,7 +22,7 @@ from surgsim_env.palpation import SitePress, press_alone, press_phases
 from surgsim_env.rendering import gl
 from surgsim_env.scene import load_anatomy, make_scene
 
-# What each extra of the package is for; `dev` is for its own tests.
+# Feature of each extra of the package; `dev` is for its own tests.
 FEATURES = {
     "agents": "training and scoring of agents (agents/, surgsim evaluate)",
     "bench": "other simulators in `surgsim bench`",
@@ -36,8 +36,8 @@ FEATURES = {
     "tetwild": "surgsim organ --mesher tetwild",
     "video": "films of episodes",
 }
-# The self-test presses the middle of the top of this scene's healthy organ: the force on the tip [N], and the relative
-# difference that rounding in libraries of other versions may make.
+# The self-test presses the middle of the top of this scene's healthy organ: the force on the tip [N], and the largest
+# relative difference by rounding in libraries of other versions.
 SCENE = "phantom_small"
 PRESS_FORCE = 0.24889498671636784
 FORCE_TOLERANCE = 1e-6
@@ -47,7 +47,7 @@ State = Literal["ok", "missing", "broken"]
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the report: what was looked at, its state and what was found."""
+    """A line of the report: subject, its state and a text."""
 
     subject: str
     state: State
@@ -62,7 +62,7 @@ class Doctor:
     """Check this installation, a line for each part: ok, missing (a feature is not available) or broken."""
 
     def run(self, console: Console) -> int:
-        """Print the findings as they are made; returns 1 where something is broken."""
+        """Print the findings; returns 1 if a part is broken."""
         broken = False
         for finding in findings():
             console.print(str(finding), highlight=False, soft_wrap=True, markup=False)
@@ -78,10 +78,10 @@ def findings() -> Iterator[Finding]:
 
 
 def attempted(check: Callable[[], Finding]) -> Finding:
-    """The finding of a check; one that raises an error is broken."""
+    """The finding of a check; broken if it raises an error."""
     try:
         return check()
-    except Exception as error:  # whatever fails on a machine is what this command is to say
+    except Exception as error:  # any failure on this machine is a finding
         return Finding(check.__name__, "broken", f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
@@ -97,7 +97,7 @@ def cores() -> Finding:
 
 
 def opengl() -> Finding:
-    """Whether pictures can be drawn, and by what."""
+    """Rendering of pictures, and its renderer."""
     try:
         context = gl.context()
     except gl.NoGLError as error:
@@ -125,9 +125,9 @@ def cache() -> Finding:
 
 
 def loop() -> Finding:
-    """Whether haptic steps run compiled."""
-    if why := mujoco_library.missing():
-        return Finding("haptic steps", "missing", f"the compiled loop; they run in Python, more slowly: {why}")
+    """Haptic steps, compiled or in Python."""
+    if reason := mujoco_library.missing():
+        return Finding("haptic steps", "missing", f"the compiled loop; they run in Python, more slowly: {reason}")
     if mujoco_library.runs_compiled():
         return Finding("haptic steps", "ok", "compiled, MuJoCo's included")
     chosen = os.environ[mujoco_library.LOOP_VARIABLE]
@@ -135,7 +135,7 @@ def loop() -> Finding:
 
 
 def press() -> Finding:
-    """A press, whose force must be the stored one."""
+    """A press, compared with the stored force."""
     scene = make_scene(SCENE)
     simulation = Simulation(load_anatomy(scene))
     low, high = simulation.rest_position.min(axis=0), simulation.rest_position.max(axis=0)
@@ -149,17 +149,17 @@ def press() -> Finding:
 
 
 def packages() -> Iterator[Finding]:
-    """What the package requires, and what each extra lacks."""
+    """Required packages, and missing ones of each extra."""
     required = [Requirement(text) for text in metadata.requires("surgsim") or []]
-    always = [one for one in required if applies(one, "")]
-    wrong = [text for one in always if (text := lack(one))]
-    versions = ", ".join(f"{one.name} {metadata.version(one.name)}" for one in always if not lack(one))
+    always = [item for item in required if applies(item, "")]
+    wrong = [text for item in always if (text := lack(item))]
+    versions = ", ".join(f"{item.name} {metadata.version(item.name)}" for item in always if not lack(item))
     way_out = f"; {', '.join(wrong)}: pip install surgsim again" if wrong else ""
     yield Finding(
         "packages", "broken" if wrong else "ok", f"surgsim {metadata.version('surgsim')}, {versions}{way_out}"
     )
     for extra, feature in FEATURES.items():
-        lacking = [text for one in required if applies(one, extra) and not applies(one, "") and (text := lack(one))]
+        lacking = [text for item in required if applies(item, extra) and item not in always and (text := lack(item))]
         if lacking:
             yield Finding(extra, "missing", f"{feature}: {', '.join(lacking)}: pip install 'surgsim[{extra}]'")
         else:
@@ -167,12 +167,12 @@ def packages() -> Iterator[Finding]:
 
 
 def applies(requirement: Requirement, extra: str) -> bool:
-    """Whether a requirement holds here with an extra, or without one ("")."""
+    """True if a requirement holds on this machine with an extra, or without one ("")."""
     return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 
 def lack(requirement: Requirement) -> str:
-    """What is wrong with a required package, or ""."""
+    """Fault of a required package, or ""."""
     try:
         version = metadata.version(requirement.name)
     except metadata.PackageNotFoundError:

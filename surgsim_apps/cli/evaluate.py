@@ -13,8 +13,8 @@ from surgsim_apps.scoring.options import ScoringOptions
 class Evaluate:
     """Score a method on fixed seeds: a search or a script by name, a trained policy, or an agent of your own.
 
-    Give one of --agent, --policy, --all and --compare. Results, the agents' interface and what makes
-    a score comparable: docs/own_agent.md. Reading a policy's files runs no code of its author.
+    Give one of --agent, --policy, --all and --compare. Results, the agents' interface and the rules for comparable
+    scores: docs/own_agent.md. Reading a policy's files runs no code of its author.
     """
 
     agent: MaybeText = None
@@ -31,12 +31,11 @@ class Evaluate:
         """Play, print and write; returns 0.
 
         Raises:
-            ValueError: not one of the four, options that do not go with it, a missing package, an unknown method.
+            ValueError: not one of the four, an unsuitable option, a missing package, an unknown method.
         """
-        asked = [name for name in ("agent", "policy", "all", "compare") if getattr(self, name)]
-        if len(asked) != 1:
-            told = " and ".join(f"--{name}" for name in asked) or "none"
-            raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {told}")
+        modes = [f"--{name}" for name in ("agent", "policy", "all", "compare") if getattr(self, name)]
+        if len(modes) != 1:
+            raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {' and '.join(modes) or 'none'}")
         options = self.played
         if (options.env or options.env_kwargs) and ":" not in (self.agent or ""):
             raise ValueError(
@@ -52,5 +51,5 @@ class Evaluate:
             elif self.all:
                 evaluate.evaluate_all(options, console)
             elif self.compare is not None:
-                evaluate.print_comparison(*self.compare, console)
+                evaluate.print_comparison(self.compare, console)
         return 0

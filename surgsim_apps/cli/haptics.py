@@ -1,4 +1,4 @@
-"""`surgsim haptics`: a device holds a scene's instrument in real time."""
+"""`surgsim haptics`: a scene's instrument in the hand of a haptic device, in real time."""
 
 import csv
 import gc
@@ -40,17 +40,17 @@ class Haptics:
     scene: str = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     motion: MaybeText = None
-    """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
+    """Breathing of the patient: calm, free, or none (holds still); default: the scene's."""
     apnoea: bool = False
-    """Hold the breath throughout; without it, the device's second button holds it while it is pressed."""
+    """Hold the breath throughout; without it, the device's second button holds the breath."""
     port: int = PORT
-    """UDP port on 127.0.0.1 to which the bridge sends its poses; 0 for a free one."""
+    """UDP port on 127.0.0.1 for poses from the bridge; 0 for a free one."""
     trajectory: Path | None = None
     """A CSV file with columns time [s], x, y, z [m], instead of a bridge."""
     device_damping: float | None = None
-    """Damping of a device that pushes back [N s/m]; without it, the force is assumed to be displayed and not felt."""
+    """Damping of a device with force feedback [N s/m]; without it, the force counts as displayed, not felt."""
     device_mass: float = 0.05
-    """Mass of a device that pushes back, at its handle [kg]."""
+    """Mass of a device with force feedback, at its handle [kg]."""
     device_delay: float = 0.0
     """Delay of pose and force together [s]."""
     seconds: float | None = None
@@ -63,7 +63,7 @@ class Haptics:
 
         Raises:
             ValueError: an unknown scene or motion, a bad trajectory, two arms, apnoea without breathing.
-            OSError: the port is taken, or a file cannot be read.
+            OSError: a taken port, or an unreadable file.
         """
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
             raise ValueError(f"--seconds is {self.seconds:g}; it must be finite and above 0")
@@ -98,19 +98,19 @@ class Haptics:
             pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
             step, a_second = 0, round(1.0 / simulation.haptic_dt)
             count = None if self.seconds is None else round(self.seconds / simulation.haptic_dt)
-            # Ctrl-C ends a run that has no end of its own.
+            # Ctrl-C ends a run without an end of its own.
             with suppress(KeyboardInterrupt):
                 while count is None or step < count:
                     pacer.wait()
-                    told = loop.step()
-                    note(told)
+                    telemetry = loop.step()
+                    note(telemetry)
                     step += 1
                     if step % a_second == 0:
-                        tip = told.tip
+                        tip = telemetry.tip
                         size = float((tip.contact_force @ tip.contact_force) ** 0.5)
-                        console.print(f"{told.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
-                    if told.fault:
-                        console.print(f"the organ diverged and is reset: {told.fault}")
+                        console.print(f"{telemetry.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
+                    if telemetry.fault:
+                        console.print(f"the organ diverged and is reset: {telemetry.fault}")
                         loop.reset(tip_position=parked_place(anatomy))
                     pacer.done(simulation.haptic_dt)
                     if count is None and isinstance(device, TrajectoryDevice) and device.over:
@@ -128,7 +128,7 @@ class Haptics:
 
 @contextmanager
 def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | TrajectoryDevice]:
-    """The device that the options choose, closed at the end."""
+    """The device of the options, closed at the end."""
     dynamics = _dynamics(command)
     if command.trajectory is not None:
         yield TrajectoryDevice.load(command.trajectory, haptic_step=haptic_step)
@@ -138,7 +138,7 @@ def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | Trajec
 
 
 def _dynamics(command: Haptics) -> DeviceDynamics | None:
-    """Of a device that pushes back."""
+    """Dynamics of a device with force feedback."""
     if command.device_damping is None:
         return None
     if command.trajectory is not None:
@@ -148,9 +148,9 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
 
 @contextmanager
 def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
-    """A function that writes a step to telemetry.csv of a folder; without a folder it does nothing."""
+    """A writer of steps to telemetry.csv of a folder; without a folder it does nothing."""
     if folder is None:
-        yield lambda told: None
+        yield lambda telemetry: None
         return
     with (
         output_folder(folder, [TELEMETRY_NAME]) as files,
@@ -158,11 +158,11 @@ def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], obje
     ):
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
-        yield lambda told: writer.writerow(_row(told))
+        yield lambda telemetry: writer.writerow(_row(telemetry))
 
 
-def _row(told: HapticTelemetry) -> list[float | int]:
-    tip = told.tip
+def _row(telemetry: HapticTelemetry) -> list[float | int]:
+    tip = telemetry.tip
     vectors = [value for name in VECTORS for value in getattr(tip, name).tolist()]
     numbers = [getattr(tip, name) for name in NUMBERS]
-    return [told.time, *vectors, *numbers, *(int(getattr(tip, name)) for name in FLAGS)]
+    return [telemetry.time, *vectors, *numbers, *(int(getattr(tip, name)) for name in FLAGS)]

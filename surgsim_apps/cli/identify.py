@@ -1,4 +1,4 @@
-"""`surgsim identify`: from recorded presses on tissue to a material."""
+"""`surgsim identify`: a material from recorded presses on tissue."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,13 +21,13 @@ class Identify:
     recordings: tyro.conf.Positional[tuple[Path, ...]]
     """CSV files with the columns site, depth_mm, normal_force_n and, if known, x_mm, y_mm, z_mm, time_s; one tissue."""
     ball_radius: float = 0.00635
-    """Radius of the ball that pressed [m]."""
+    """Radius of the pressing ball [m]."""
     thickness: MaybeNumber = None
     """Thickness of the tissue on its rigid bed [m]; default: searched, with an interval."""
     poisson_ratio: float = 0.45
-    """Poisson's ratio of the tissue; presses alone do not tell it."""
+    """Poisson's ratio of the tissue; not identifiable by presses alone."""
     seed: int = 0
-    """Seed that draws which half of the sites is fitted."""
+    """Seed for drawing the fitted half of the sites."""
     out: MaybePath = None
     """Folder for the results; default: the next free runs/identify-NAME-NUMBER."""
 
@@ -38,11 +38,11 @@ class Identify:
         return command_text(["surgsim", "identify", *map(str, self.recordings)], options)
 
     def run(self, console: Console) -> int:
-        """Identify, print the errors and what the data cannot tell, write the results; returns 0.
+        """Identify, print the errors and unidentifiable parameters, write the results; returns 0.
 
         Raises:
-            ValueError: no recording, one that cannot be read or used, a value out of range.
-            OSError: the folder cannot be written (checked before the work).
+            ValueError: no recording, an unreadable or unusable one, a value out of range.
+            OSError: a read-only folder (checked before the work).
         """
         from surgsim_apps.identify import results
         from surgsim_apps.identify.identification import IdentifyOptions, identify
@@ -54,13 +54,13 @@ class Identify:
         sets = [read_recording(path) for path in self.recordings]
         default = Path("runs") / f"identify-{sets[0].name}"
         with output_folder(self.out or default, results.RESULT_NAMES, numbered=self.out is None) as files:
-            found = identify(sets, options, console=console)
-            results.write_material(found, files / results.MATERIAL_NAME, self.command_line)
-            results.write_sites(found, files / results.SITES_NAME)
-            results.write_curves(found, files / results.CURVES_NAME)
-            has_map = results.write_map(found, files / results.MAP_NAME)
-            results.write_summary(found, files / results.SUMMARY_NAME, self.command_line)
-        results.print_result(found, console)
+            identification = identify(sets, options, console=console)
+            results.write_material(identification, files / results.MATERIAL_NAME, self.command_line)
+            results.write_sites(identification, files / results.SITES_NAME)
+            results.write_curves(identification, files / results.CURVES_NAME)
+            has_map = results.write_map(identification, files / results.MAP_NAME)
+            results.write_summary(identification, files / results.SUMMARY_NAME, self.command_line)
+        results.print_result(identification, console)
         written = [name for name in results.RESULT_NAMES if has_map or name != results.MAP_NAME]
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0

@@ -1,4 +1,4 @@
-"""Commands of `surgsim`: how they are chosen, and how their errors and warnings are told."""
+"""Commands of `surgsim`, with their exit status, errors and warnings."""
 
 import sys
 import warnings
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = tyro.cli(
             Command, prog="surgsim", args=arguments, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
         )
-    # After --help, or after tyro has printed what is wrong with the options.
+    # After --help, or after tyro's message about the options.
     except SystemExit as ended:
         return 2 if ended.code else 0
     try:

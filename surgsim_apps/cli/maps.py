@@ -1,4 +1,4 @@
-"""`surgsim maps`: the healthy maps of a family's members, made ahead of episodes."""
+"""`surgsim maps`: healthy maps of a family's members, made ahead of episodes."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from surgsim_env.scene import MemberName, family_of, make_scene
 class Maps:
     """Press the healthy members of a family ahead of time: episodes of SurgSim/PalpateSites-v0 need their maps.
 
-    An episode with a member whose map is not in the cache presses it then, which takes some seconds.
+    An episode with a member without a map in the cache presses it first, in some seconds.
     """
 
     scene: str = "liver_family"
@@ -21,10 +21,10 @@ class Maps:
     """Its part: train, validation or test."""
 
     def run(self, console: Console) -> int:
-        """Press every member of the split whose map is not in the cache.
+        """Press every member of the split without a map in the cache.
 
         Raises:
-            ValueError: an unknown scene or split, a scene of one organ, a press that ends in a fault.
+            ValueError: an unknown scene or split, a scene of one organ, a fault during a press.
         """
         template = still_template(make_scene(self.scene))
         family = family_of(template, self.split)

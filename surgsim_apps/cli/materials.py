@@ -1,4 +1,4 @@
-"""`surgsim materials`: the library of materials and where their numbers come from."""
+"""`surgsim materials`: the library of materials with the sources of their numbers."""
 
 from dataclasses import dataclass
 
@@ -12,38 +12,36 @@ from surgsim_env.scene import list_materials, make_material
 
 @dataclass(frozen=True)
 class Materials:
-    """List the materials that a scene can name ([material] name = "..."), with condition, interval and source."""
+    """List the materials for scenes ([material] name = "..."), with condition, interval and source."""
 
     name: MaybeText = None
     """Only this material: a name of the list, or the path of a material's TOML file."""
 
     def run(self, console: Console) -> int:
-        """Print a table of the library, or all that is known of one material.
+        """Print a table of the library, or everything about one material.
 
         Raises:
-            ValueError: an unknown name, or a file that breaks the format.
+            ValueError: an unknown name, or a file in another format.
         """
         if self.name is not None:
-            found = make_material(self.name)
-            console.print(f"{found.name}: {found.description}", highlight=False, markup=False)
-            for what in (law_text(found.material), *(f"{key}: {getattr(found, key)}" for key in _TOLD)):
-                console.print(f"  {what}", highlight=False, markup=False)
+            material = make_material(self.name)
+            console.print(f"{material.name}: {material.description}", highlight=False, markup=False)
+            facts = [f"{key}: {getattr(material, key)}" for key in ("condition", "interval", "source")]
+            for fact in (law_text(material.material), *facts):
+                console.print(f"  {fact}", highlight=False, markup=False)
             return 0
         table = Table("material", "what it is", "E [kPa]", "law")
         for name in list_materials():
-            found = make_material(name)
-            modulus = f"{found.material.youngs_modulus / 1000.0:.4g}"
-            table.add_row(name, found.description, modulus, ", ".join(parts_of_law(found.material)) or "linear")
+            material = make_material(name)
+            modulus = f"{material.material.youngs_modulus / 1000.0:.4g}"
+            table.add_row(name, material.description, modulus, ", ".join(parts_of_law(material.material)) or "linear")
         console.print(table)
         console.print("surgsim materials --name NAME: source, condition and interval", highlight=False)
         return 0
 
 
-_TOLD = ("condition", "interval", "source")
-
-
 def parts_of_law(material: Material) -> list[str]:
-    """What a material's law has besides linear springs: "stiffening", "relaxation"."""
+    """Parts of a material's law besides linear springs: "stiffening", "relaxation"."""
     return [part for part in ("stiffening", "relaxation") if getattr(material, part, None) is not None]
 
 

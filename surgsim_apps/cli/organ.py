@@ -21,16 +21,16 @@ class Organ:
 
     files: tyro.conf.Positional[tuple[Path, ...]]
     """A label image (nii, nii.gz, nrrd, dcm); or closed surfaces (STL, OBJ, PLY), the organ first, then a file for each
-    region in it, which names the region; or one file of tets (vtu, vtk, msh, mesh)."""
+    region in it, named after the region; or one file of tets (vtu, vtk, msh, mesh)."""
     labels: MaybeText = None
     """NAME=LABEL,...: the labels of an image, or the region tags of tets, the organ first, such as liver=1,lesion=2."""
     length_unit: MaybeText = None
     """Unit of the file: m, cm, mm, or metres per unit as a number; required if the format states none."""
     cell_size: MaybeNumber = None
-    """Cell size of the lattice that fills the organ [m], the same everywhere, from which the tip follows; default:
-    cells follow from the tip, fine at the pressed face and coarse elsewhere."""
+    """Cell size of the organ's lattice [m], the same everywhere; the tip follows from it. Default: cells follow from
+    the tip, fine at the pressed face and coarse elsewhere."""
     tip_radius: MaybeNumber = None
-    """Radius of the ball tip [m]; default: 5 mm, or 6 mm for organs above 500 ml, as passes a trocar of 12 mm."""
+    """Radius of the ball tip [m]; default: 5 mm, or 6 mm for organs above 500 ml, suitable for a trocar of 12 mm."""
     press_depth: MaybeNumber = None
     """Depth of a press [m]; default: 7/12 of the tip's radius."""
     out: MaybePath = None
@@ -44,12 +44,12 @@ class Organ:
     mend: bool = False
     """Close holes, resolve self-intersections and fill cavities, and report it."""
     remesh: bool = False
-    """Fill the surfaces of a file of tets anew, with cells that suit the tip; else its tets are kept."""
+    """Fill the surfaces of a file of tets anew, with cells suited to the tip; else its tets are kept."""
     mesher: MaybeText = None
     """lattice (default), or tetwild for conforming region surfaces (extra `tetwild`)."""
 
     healthy_map: bool = True
-    """Press the healthy organ at every site and write the map, with which SurgSim/PalpateSites-v0 starts at once.
+    """Press the healthy organ at every site and write the map, for an immediate start of SurgSim/PalpateSites-v0.
     Without it the first `gym.make` presses these sites."""
 
     @property
@@ -64,14 +64,14 @@ class Organ:
         """Make an organ, print a summary of it, and with `out` write its mesh, its scenes and its report.
 
         Raises:
-            MeshError: a file that cannot become an organ.
-            ValueError: options that do not go together, or a place that cannot be written.
+            MeshError: a file unusable as an organ.
+            ValueError: conflicting options, or a read-only place.
         """
         from msdm_core.mesh_files import FORMATS, SURFACE_SUFFIXES
         from surgsim_apps.palpate.scene_options import SceneOptions
         from surgsim_apps.patient import make_patient as patient
         from surgsim_apps.patient.label_image import IMAGE_SUFFIXES, is_image
-        from surgsim_apps.patient.retract_scene import told
+        from surgsim_apps.patient.retract_scene import retraction_text
 
         if not self.files:
             raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
@@ -95,7 +95,7 @@ class Organ:
             patient.check_target(self.out)
         out = self.out or Path("patient.vtu")
         with StepProgress(console) as progress:
-            found = patient.make_patient(
+            organ = patient.make_patient(
                 self.files,
                 out,
                 labels=self.labels,
@@ -113,14 +113,14 @@ class Organ:
                 moduli=_moduli(self.modulus),
                 progress=progress,
             )
-            found = patient.with_hold(found, progress)
+            organ = patient.with_hold(organ, progress)
             with progress.step("seeking an edge to lift"):
-                found, retraction = patient.add_retraction(found, out)
-            patient.print_patient(found, console)
-            console.print(f"retraction: {told(retraction)}", highlight=False)
+                organ, retraction = patient.add_retraction(organ, out)
+            patient.print_patient(organ, console)
+            console.print(f"retraction: {retraction_text(retraction)}", highlight=False)
             if self.out is not None:
                 written = patient.write_patient(
-                    found, self.out, self.command_line, retraction, healthy_map=self.healthy_map, progress=progress
+                    organ, self.out, self.command_line, retraction, healthy_map=self.healthy_map, progress=progress
                 )
                 console.print(f"written: {', '.join(map(str, written))}", highlight=False, soft_wrap=True)
         return 0

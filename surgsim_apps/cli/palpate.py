@@ -14,18 +14,11 @@ from surgsim_apps.cli.values import (
     vector_of,
 )
 from surgsim_apps.palpate.figures import write_stiffness_map
-from surgsim_apps.palpate.job import (
-    CSV_NAME,
-    MODEL_MODULUS_ERROR,
-    PICTURE_NAME,
-    SUMMARY_NAME,
-    plan_sites,
-    print_report,
-    run_palpation,
-    write_csv,
-    write_summary,
-)
-from surgsim_apps.palpate.scene_options import SceneOptions, load_stable_anatomy, with_options
+from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, load_stable_anatomy, run_palpation
+from surgsim_apps.palpate.report import print_report
+from surgsim_apps.palpate.results import CSV_NAME, PICTURE_NAME, SUMMARY_NAME, write_csv, write_summary
+from surgsim_apps.palpate.scene_options import SceneOptions, with_options
+from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.scene import Anatomy, Ball, Vector, load_anatomy, load_scene, make_scene
 from surgsim_env.step_progress import StepProgress
@@ -33,7 +26,7 @@ from surgsim_env.step_progress import StepProgress
 
 @dataclass(frozen=True)
 class Palpate:
-    """Press an organ site by site, map its stiffness, and report where lesions were felt.
+    """Press an organ site by site, map its stiffness, and report the felt lesions.
 
     Lengths are in metres, forces in newtons. Writes palpation.csv, stiffness_map.png and summary.json.
     """
@@ -63,7 +56,7 @@ class Palpate:
 
     @property
     def options(self) -> SceneOptions:
-        """Options that replace values of the scene."""
+        """Replacements of values of the scene."""
         return SceneOptions(
             approach=vector_of("--approach", self.approach),
             press_depth=self.press_depth,
@@ -71,33 +64,34 @@ class Palpate:
         )
 
     def run(self, console: Console) -> int:
-        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the lesions found.
+        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the felt lesions.
 
         Raises:
-            ValueError: options that do not go together, impossible values, a scene file that cannot be read.
+            ValueError: conflicting options, impossible values, an unreadable scene file.
         """
         _check(self)
-        around, asked, below = _around(self), _asked_lesions(self), _asked_below(self)
+        around, lesion_options, below = _around(self), _asked_lesions(self), _asked_below(self)
         scene = load_scene(self.organ) if self.organ else make_scene(self.scene or "liver")
         scene = with_options(scene, self.options)
         names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
         default = Path("runs") / f"palpate-{scene.name}"
         with output_folder(self.out or default, names, numbered=self.out is None) as files:
-            with StepProgress(console) as progress, progress.step("preparing the organ"):
-                anatomy = load_anatomy(scene)
-                lesions = anatomy.demonstration_lesions()
-                if asked or below:
-                    places = [*asked, *(_below_site(anatomy, *one) for one in below)]
-                    lesions = [anatomy.lesion_at(*one, f"lesion {n}") for n, one in enumerate(places, start=1)]
-                    for lesion in lesions:
-                        anatomy.check_inside(lesion)
-                anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
-            found = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, console=console)
-            with StepProgress(console) as progress, progress.step("drawing the map"):
-                write_csv(found, files / CSV_NAME)
-                write_summary(found, files / SUMMARY_NAME, vars(self))
-                write_stiffness_map(found, files / PICTURE_NAME)
-        print_report(found, console)
+            with StepProgress(console) as progress:
+                with progress.step("preparing the organ"):
+                    anatomy = load_anatomy(scene)
+                    lesions = anatomy.demonstration_lesions()
+                    if lesion_options or below:
+                        places = [*lesion_options, *(_below_site(anatomy, *lesion) for lesion in below)]
+                        lesions = [anatomy.lesion_at(*place, f"lesion {n}") for n, place in enumerate(places, start=1)]
+                        for lesion in lesions:
+                            anatomy.check_inside(lesion)
+                    anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
+                palpation = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, progress=progress)
+                with progress.step("drawing the map"):
+                    write_csv(palpation, files / CSV_NAME)
+                    write_summary(palpation, files / SUMMARY_NAME, vars(self))
+                    write_stiffness_map(palpation, files / PICTURE_NAME)
+        print_report(palpation, console)
         console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
         return 0
 
@@ -120,18 +114,18 @@ def _around(command: Palpate) -> Ball | None:
 
 def _asked_lesions(command: Palpate) -> list[tuple[Vector, float, float]]:
     """Centre [m], radius [m] and modulus ratio of each --lesion."""
-    asked = []
+    lesions = []
     for text in command.lesion:
         x, y, z, radius, ratio = numbers_of("--lesion", text, "x,y,z,radius,ratio")
         if not ratio > 0.0:
             raise ValueError(f"--lesion {text}: the modulus ratio is {ratio:g}; it must be above 0")
-        asked.append(((x, y, z), radius, ratio))
-    return asked
+        lesions.append(((x, y, z), radius, ratio))
+    return lesions
 
 
 def _asked_below(command: Palpate) -> list[tuple[int, float, float, float]]:
     """Site, depth of the centre [m], radius [m] and modulus ratio of each --lesion-below."""
-    asked = []
+    lesions = []
     for text in command.lesion_below:
         site, depth, radius, ratio = numbers_of("--lesion-below", text, "SITE,DEPTH,RADIUS,RATIO")
         if site != int(site) or site < 0:
@@ -143,8 +137,8 @@ def _asked_below(command: Palpate) -> list[tuple[int, float, float, float]]:
                 f"--lesion-below {text}: the centre is {depth * 1e3:g} mm deep, the radius {radius * 1e3:g} mm; the "
                 "rule is depth > radius > 0, or it sticks out of the organ"
             )
-        asked.append((int(site), depth, radius, ratio))
-    return asked
+        lesions.append((int(site), depth, radius, ratio))
+    return lesions
 
 
 def _below_site(anatomy: Anatomy, site: int, depth: float, radius: float, ratio: float) -> tuple[Vector, float, float]:

@@ -1,4 +1,4 @@
-"""`surgsim retract`: an oracle script retracts a lobe; trace, forces, pictures and summary are written."""
+"""`surgsim retract`: a scripted retraction of a lobe, with trace, forces, pictures and summary."""
 
 import json
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ VIEWS = ("overview", "endoscope")
 
 @dataclass(frozen=True)
 class Retract:
-    """Run an oracle script that grasps a lobe and folds it back to expose a target; with two arms, it touches it.
+    """Run an oracle script: grasp a lobe and fold it back to expose a target; with two arms, touch the target.
 
     Writes trace.csv, trace_control.csv, forces.png, retraction.png (before and after) and summary.json. Exit status 1
-    if it does not succeed.
+    on failure.
     """
 
     scene: str = "lobe"
@@ -45,7 +45,7 @@ class Retract:
         """Run one scripted retraction, print its result and write its files; 0 if it succeeded, 1 otherwise.
 
         Raises:
-            ValueError: one line about an option that is not possible.
+            ValueError: an impossible option, in one line.
         """
         from PIL import Image
 
@@ -81,7 +81,7 @@ class Retract:
 
 
 def _pictures(env: gym.Env, console: Console) -> NDArray[np.uint8] | None:
-    """The views side by side; None, with a message, where OpenGL is missing."""
+    """The views side by side; None, with a message, without OpenGL."""
     inner = env.unwrapped
     assert isinstance(inner, SurgicalEnv)
     try:
@@ -92,7 +92,7 @@ def _pictures(env: gym.Env, console: Console) -> NDArray[np.uint8] | None:
 
 
 def _summary(trace: Trace) -> dict[str, Any]:
-    """The episode's duration, return and steps, and the last info, as JSON holds them."""
+    """The episode's duration, return and steps, and the last info, for JSON."""
     return {
         "duration": trace.duration,
         "return": float(trace.reward.sum()),

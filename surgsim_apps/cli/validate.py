@@ -10,27 +10,27 @@ from surgsim_apps.reports.output_folder import output_folder
 
 @dataclass(frozen=True)
 class Validate:
-    """Compare the tissue with closed forms and finite elements, print the table, and write it with its plots.
+    """Compare the tissue with closed forms and finite elements; print the table, write it with its plots.
 
     Exit status 0: every row is met or is a known shortfall (surgsim_apps/validation/known_shortfalls.toml); else 1.
     """
 
     quick: bool = False
-    """Only the cases that take seconds."""
+    """Only cases of some seconds."""
     out: MaybePath = None
-    """Folder for validation.md and images/. Default: docs/ of a checkout; runs/validation elsewhere or with --quick."""
+    """Folder for validation.md, .csv and images/. Default: docs/ of a checkout; else, or --quick, runs/validation."""
 
     def run(self, console: Console) -> int:
         """Run the cases, print and write the report; returns the exit status.
 
         Raises:
-            OSError: the folder cannot be written (checked before the work).
+            OSError: a read-only folder (checked before the work).
         """
         from surgsim_apps.validation import suite
-        from surgsim_apps.validation.report import REPORT_NAME, print_report, write_report
+        from surgsim_apps.validation.report import REPORT_NAME, TABLE_NAME, print_report, write_report
 
         folder = report_folder(self.out, "validation", quick=self.quick)
-        with output_folder(folder, [REPORT_NAME]) as files:
+        with output_folder(folder, [REPORT_NAME, TABLE_NAME]) as files:
             validation = suite.run_cases(quick=self.quick, console=console)
             print_report(validation, console)
             write_report(validation, files)

@@ -1,4 +1,4 @@
-"""Types of command-line options, values of options that are text, and default folders of reports."""
+"""Types of command-line options, parsing of their texts, and default folders of reports."""
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def numbers_of(option: str, text: str, form: str) -> tuple[float, ...]:
-    """The numbers of a list such as 0,0,-1; a ValueError states the required form, such as x,y,z."""
+    """The numbers of a list such as 0,0,-1; a ValueError quotes the required form, such as x,y,z."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -31,7 +31,7 @@ def numbers_of(option: str, text: str, form: str) -> tuple[float, ...]:
 
 
 def vector_of(option: str, text: str | None) -> tuple[float, float, float] | None:
-    """The three numbers of an option such as --approach 0,0,-1; None if it is not given."""
+    """The three numbers of an option such as --approach 0,0,-1; None without it."""
     if text is None:
         return None
     x, y, z = numbers_of(option, text, "x,y,z")
@@ -53,18 +53,18 @@ def command_text(words: Sequence[str], options: Mapping[str, object]) -> str:
     words = list(words)
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
-        for one in value if isinstance(value, tuple) else (value,):
-            if one is None or one is False:
+        for item in value if isinstance(value, tuple) else (value,):
+            if item is None or item is False:
                 continue
             # A shell word such as -1,0,0 would be parsed as an option.
-            joined = str(one).startswith("-")
-            words += [option] if one is True else [f"{option}={one}"] if joined else [option, str(one)]
+            joined = str(item).startswith("-")
+            words += [option] if item is True else [f"{option}={item}"] if joined else [option, str(item)]
     return shlex.join(words)
 
 
 @contextmanager
 def missing_packages(command: str, extra: str) -> Iterator[None]:
-    """Raise a ValueError that names the extra of pyproject.toml where a package is not installed."""
+    """Turn a missing package into a ValueError with the extra of pyproject.toml."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -75,6 +75,6 @@ def missing_packages(command: str, extra: str) -> Iterator[None]:
 
 
 def report_folder(folder: Path | None, name: str, *, quick: bool) -> Path:
-    """Where a report goes: the given folder, else docs/ of a checkout; elsewhere and for a quick run runs/NAME."""
+    """Folder of a report: the option's, else docs/ of a checkout; elsewhere and for a quick run runs/NAME."""
     checkout = (ROOT / "pyproject.toml").is_file()
     return folder or (ROOT / "docs" if checkout and not quick else Path("runs") / name)

@@ -10,7 +10,7 @@ from rich.console import Console
 from surgsim_apps.cli.values import MaybeText, missing_packages
 from surgsim_env.scene import make_scene, with_instrument, with_motion
 
-# The scene that has ports for two arms, and the two that work there.
+# The scene with ports for two arms, and its arms.
 BIMANUAL_SCENE, BIMANUAL_INSTRUMENT = "lobe", "psm_pair"
 
 
@@ -28,7 +28,7 @@ class View:
     bimanual: bool = False
     """Two arms: a jaw to lift, a ball to touch."""
     motion: MaybeText = None
-    """How the patient breathes: calm, free, or none (holds still); default: as the scene has it."""
+    """Breathing of the patient: calm, free, or none (holds still); default: the scene's."""
     port: int = 8080
     """Port of 127.0.0.1 to listen on, or the next free one; 0 for any free one."""
     out: Path = Path("runs/live")
@@ -40,8 +40,8 @@ class View:
         """Serve until interrupted, or for some seconds.
 
         Raises:
-            ValueError: a scene, an instrument or an option that is invalid; viser is not installed.
-            LiveError: the physics died, or viser cannot be guarded.
+            ValueError: an invalid scene, instrument or option, or no viser.
+            LiveError: the physics died, or an unknown version of viser.
         """
         with missing_packages("view", "live"):
             import viser  # noqa: F401
@@ -66,7 +66,7 @@ class View:
             try:
                 page.run(lambda: time.monotonic() >= end)
             finally:
-                # However it ends: Ctrl-C, or a physics that died.
+                # At any end: Ctrl-C, or death of the physics.
                 if written := page.end_recording():
                     console.print(written, highlight=False, soft_wrap=True)
         finally:

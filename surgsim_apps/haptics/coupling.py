@@ -8,7 +8,7 @@ from surgsim_apps.haptics.device import DeviceDynamics, require_positive
 # Stiffness of a default coupling as a share of the limit, and its damping as a share of the device's.
 STIFFNESS_SHARE = 0.8
 DAMPING_SHARE = 0.25
-# Default stiffness if no device's damping limits it [N/m]: a probe then lags by a millimetre or two.
+# Default stiffness without a limit by a device's damping [N/m]: a probe then lags by a millimetre or two.
 STIFFNESS_FREE = 500.0
 
 
@@ -44,7 +44,7 @@ class TipDynamics:
 
 
 def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, haptic_step: float) -> float:
-    """The stiffest coupling that is passive for any hand and organ [N/m]; 0 if there is none.
+    """The stiffest passive coupling for any hand and organ [N/m]; 0 if there is none.
 
     A force held for T while device and tip move by T v_d and T v_t (velocities of one step) differs from the spring's;
     the difference adds at most T (K T / 2 + |B|) (|v_d| + |v_t|)^2 of energy per step, and a lag L between pose and
@@ -62,15 +62,15 @@ def stiffness_limit(device: DeviceDynamics, tip: TipDynamics, damping: float, ha
         damping: B of the coupling [N s/m].
         haptic_step: T [s].
     """
-    lag, mine, other = device.delay, device.damping, tip.damping
+    lag, own, other = device.delay, device.damping, tip.damping
     # (b_d - S - D)(b_t - S) - (S + D/2)^2 = b_d b_t - S (b_d + b_t) - D b_t - D^2 / 4, a quadratic in K.
-    rest = mine * other - abs(damping) * (mine + other)
-    if rest <= 0.0:
+    margin = own * other - abs(damping) * (own + other)
+    if margin <= 0.0:
         return 0.0
-    slope = 0.5 * haptic_step * (mine + other) + lag * other
+    slope = 0.5 * haptic_step * (own + other) + lag * other
     bend = 0.25 * lag * lag
     # This form of the root is also valid for bend = 0.
-    return 2.0 * rest / (slope + math.sqrt(slope * slope + 4.0 * bend * rest))
+    return 2.0 * margin / (slope + math.sqrt(slope * slope + 4.0 * bend * margin))
 
 
 def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float) -> VirtualCoupling:
@@ -79,7 +79,7 @@ def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: f
     Without a device the damping is critical for the tip's mass, within the limit of the explicit step.
 
     Raises:
-        ValueError: a device whose damping allows no coupling.
+        ValueError: a device with too little damping for any coupling.
     """
     if device is None:
         stiffness = min(STIFFNESS_FREE, 0.5 * tip.mass / haptic_step**2)
@@ -99,7 +99,7 @@ def coupling_for(device: DeviceDynamics | None, tip: TipDynamics, haptic_step: f
 def check_coupling(
     coupling: VirtualCoupling, device: DeviceDynamics | None, tip: TipDynamics, haptic_step: float
 ) -> None:
-    """Refuse a coupling that is too stiff for the device or the tip.
+    """Refuse a coupling too stiff for the device or the tip.
 
     Args:
         coupling: between device and tip.

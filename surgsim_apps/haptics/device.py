@@ -1,4 +1,4 @@
-"""The interface of a haptic device: a pose in, a force out, and the dynamics that limit the coupling's stiffness."""
+"""The interface of a haptic device: a pose in, a force out, and the dynamics for the coupling's stiffness limit."""
 
 import math
 from dataclasses import dataclass
@@ -23,14 +23,14 @@ class DevicePose(NamedTuple):
 
 @dataclass(frozen=True)
 class DeviceDynamics:
-    """Dynamics of a device that exerts forces, at its handle.
+    """Dynamics of a device with force feedback, at its handle.
 
     Args:
         damping: viscous damping b of the device itself, without a hand [N s/m]; more of it allows a stiffer coupling.
         mass: apparent mass m at the handle [kg].
         delay: of pose and force together beyond the haptic step for which a force is held [s]: transport, filters, and
             the interval of poses beyond a haptic step.
-        force_largest: largest force that it can exert [N].
+        force_largest: its largest force [N].
 
     Raises:
         ValueError: names the entry, its value and the rule.
@@ -49,7 +49,7 @@ class DeviceDynamics:
 
 
 class HapticDevice(Protocol):
-    """A device that a `HapticLoop` reads and writes once per haptic step; neither call may block."""
+    """A device of a `HapticLoop`: read and written once per haptic step, without blocking."""
 
     @property
     def dynamics(self) -> DeviceDynamics | None:
@@ -69,7 +69,7 @@ class HapticDevice(Protocol):
 
 
 def require_positive(name: str, value: float, unit: str, *, finite: bool = True, or_zero: bool = False) -> None:
-    """Refuse a number that is not above zero, or with `or_zero` below zero.
+    """Refuse a number not above zero, or with `or_zero` below zero.
 
     Raises:
         ValueError: names the number, its value and the rule.

@@ -19,7 +19,7 @@ from surgsim_env.instruments import SIDES, Pair
 
 # Poses farther from the device's origin are refused [m].
 REACH_LARGEST = 100.0
-# Time constant of the filter for a device that exerts no force [s].
+# Time constant of the filter for a device without force feedback [s].
 SMOOTHING = 0.02
 
 
@@ -27,22 +27,22 @@ class TipTelemetry(NamedTuple):
     """One device and its tip in one haptic step.
 
     Fields:
-        fresh: whether it was read in this step
+        fresh: True if it was read in this step
         target: the coupling's target in the scene [m]                                        (3,)
         tip: position of the tip at the start of the step [m]                                 (3,)
         coupling_force: of the coupling on the tip, in the scene [N]                          (3,)
         force: on the device [N]                                                              (3,)
-        contact_force: of the tissue on the tip, in the step that just ended [N]              (3,)
-        depth: of the tip's ball, or of the point between its pads, below the resting surface where it touches [m]; 0
+        contact_force: of the tissue on the tip, in this step [N]                             (3,)
+        depth: of the tip's ball, or of the point between its pads, below the resting surface at the contact [m]; 0
             without contact
-        clamped: whether the force limit acts on the coupling
-        slewed: whether the slew limit acts on the device's force
-        share: of the force that the watchdog passes, 0 to 1
-        approaching: whether the tip approaches a distant device
-        speed_limited: whether the speed limit acts on the tip
-        workspace_limited: whether the edge of its workspace stops the tip
-        refused_pose_count: poses with a number that is not finite or beyond 100 m, so far
-        device_fault: why the device could not be read or written in this step, or ""
+        clamped: True if the force limit acts on the coupling
+        slewed: True if the slew limit acts on the device's force
+        share: factor of the watchdog on the force, 0 to 1
+        approaching: True while the tip approaches a distant device
+        speed_limited: True if the speed limit acts on the tip
+        workspace_limited: True if the edge of its workspace stops the tip
+        refused_pose_count: poses with a number not finite or beyond 100 m, so far
+        device_fault: error while reading or writing the device in this step, or ""
         energy: net work of the hand on the device since the reset [J]
     """
 
@@ -65,7 +65,7 @@ class TipTelemetry(NamedTuple):
 
     @property
     def faded(self) -> bool:
-        """Whether the watchdog reduces the force."""
+        """True if the watchdog reduces the force."""
         return self.share < 1.0
 
 
@@ -74,7 +74,7 @@ class HapticTelemetry(NamedTuple):
 
     Fields:
         time: at its end [s]
-        fault: why the simulation has stopped, or ""
+        fault: reason of a stopped simulation, or ""
         tips: one per device
     """
 
@@ -91,9 +91,8 @@ class HapticTelemetry(NamedTuple):
 class PressDepth:
     """Depth of a ball below the resting surface: r - n . (tip - c) [m].
 
-    n and c are normal and centre of the touched triangle of the surface at rest that is nearest to the tip: exact for a
-    flat face, and up to the curvature within a triangle otherwise. 0 without contact. The surface at rest goes with the
-    ground where motions move that.
+    n and c are normal and centre of the nearest touched triangle of the surface at rest: exact for a flat face, and up
+    to the curvature within a triangle otherwise. 0 without contact. The surface at rest follows a moving ground.
     """
 
     def __init__(self, simulation: Simulation, radius: float) -> None:
@@ -110,7 +109,7 @@ class PressDepth:
             self._model = model
             corners = simulation.rest_position[model.surface_triangles]
             self._centres = corners.mean(axis=1)
-            # How far a unit of each motion's signal moves them [m].
+            # Displacements by a unit of each motion's signal [m].
             self._carried = [motion.shift(self._centres) for motion in simulation.anatomy.ground_motions]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -130,8 +129,7 @@ class Follower:
     """The target of a coupling: it follows the device with limited speed.
 
     It starts at the tip and moves to the device at the approach speed; from then on it follows at up to the largest
-    speed. A distant device at the start, a restored link or a jump of the pose therefore cannot throw the tip into an
-    organ.
+    speed: a distant device at the start, a restored link or a jump of the pose cannot throw the tip into an organ.
     """
 
     def __init__(
@@ -145,7 +143,7 @@ class Follower:
         self._approach, self._largest = approach_speed * haptic_step, speed_largest * haptic_step
 
     def follow(self, target: FloatArray) -> None:
-        """Move towards the device's position [m], (3,); `limited` tells whether the speed limit acted."""
+        """Move towards the device's position [m], (3,); `limited` is True if the speed limit acts."""
         x, y, z = (target - self.place).tolist()
         distance, most = math.hypot(x, y, z), self._approach if self.approaching else self._largest
         wanted = self._share * distance
@@ -171,7 +169,7 @@ class Watchdog:
 
     def __init__(self, settings: HapticSettings, haptic_step: float) -> None:
         """Count in steps of `haptic_step` [s]."""
-        # Whole steps, so that rounding does not decide when the fading begins.
+        # Whole steps: rounding does not decide the begin of the fading.
         self._patience = max(1, math.ceil(settings.timeout / haptic_step - 1e-9))
         self._down = haptic_step / settings.fade
         self._up = haptic_step / settings.resume
@@ -180,7 +178,7 @@ class Watchdog:
 
     @property
     def expired(self) -> bool:
-        """Whether there was no fresh pose for the timeout."""
+        """True without a fresh pose for the timeout."""
         return self._silent >= self._patience
 
     def step(self, fresh: bool) -> float:
@@ -198,7 +196,7 @@ class Watchdog:
 
 
 def held_within(vector: FloatArray, largest: float) -> tuple[FloatArray, bool]:
-    """The vector limited to a length, in the same direction, and whether it was longer."""
+    """The vector limited to a length, in the same direction, and True if it was longer."""
     x, y, z = vector.tolist()
     size = math.sqrt(x * x + y * y + z * z)
     if size <= largest:
@@ -215,7 +213,7 @@ class SlewLimit:
         self._force = np.zeros(3)
 
     def follow(self, force: FloatArray) -> tuple[FloatArray, bool]:
-        """The next force [N], (3,), and whether the limit changed it."""
+        """The next force [N], (3,), and True if the limit changed it."""
         change, held = held_within(force - self._force, self._most)
         self._force = self._force + change if held else force
         return self._force, held
@@ -226,7 +224,7 @@ class SlewLimit:
 
 
 class HeldTip:
-    """Reads the pose, writes the force, applies the coupling to the tip: once per haptic step, first."""
+    """A tip held by a device: reads the pose, writes the force, applies the coupling, first in each haptic step."""
 
     def __init__(
         self, device: HapticDevice, drive: TipDrive, depth: PressDepth, settings: HapticSettings, haptic_step: float
@@ -234,7 +232,7 @@ class HeldTip:
         """Couple a device to a tip.
 
         Raises:
-            ValueError: a coupling too stiff for device or tip, or a force limit above what either can exert.
+            ValueError: a coupling too stiff for device or tip, or a force limit beyond either.
         """
         self.device, self.drive, self.settings = device, drive, settings
         dynamics, smoothing = device.dynamics, settings.smoothing
@@ -301,7 +299,7 @@ class HeldTip:
 
     @property
     def holds_breath(self) -> bool | None:
-        """Whether the device's button holds the breath; None before the first pose, and without such a button."""
+        """True if the device's button holds the breath; None before the first pose, and without such a button."""
         button = self.settings.breath_button
         return None if button is None or self._pose is None else bool(self._pose.buttons >> button & 1)
 
@@ -371,7 +369,7 @@ def _check_force(what: str, wanted: float, most: float) -> None:
 
 
 class HapticLoop:
-    """Steps a simulation whose instrument is coupled to devices; `step` never raises for faults of organ or device.
+    """A simulation with its instrument coupled to devices; `step` never raises for faults of organ or device.
 
     Each step reads the devices' poses, writes the couplings' forces to devices and tips, and advances organ and
     instrument by one haptic step: a force responds to the pose of its own step.
@@ -382,7 +380,7 @@ class HapticLoop:
     Fields:
         simulation: of the instrument
         held: one per device, with its coupling
-        fault: why the simulation has stopped, or ""
+        fault: reason of a stopped simulation, or ""
     """
 
     def __init__(
@@ -399,8 +397,8 @@ class HapticLoop:
             settings: for all devices.
 
         Raises:
-            ValueError: as many devices as there are not tips; a coupling that a device or tip cannot bear (says the
-                limit); a force beyond what device or servo can push with.
+            ValueError: another number of devices than of tips; a coupling too stiff for a device or tip (with the
+                limit); a force beyond a device or servo.
         """
         self.simulation = simulation
         scene, dt = simulation.anatomy.scene, simulation.haptic_dt
@@ -450,12 +448,12 @@ class HapticLoop:
 
         Args:
             organ_model: another organ of the same scene; the same one by default.
-            tip_position: [m], (3,), or (2, 3) for a pair; where the instrument parks by default.
-            elapsed: time of the patient's motions at which it begins [s].
+            tip_position: [m], (3,), or (2, 3) for a pair; the instrument's parked position by default.
+            elapsed: start time of the patient's motions [s].
 
         Raises:
-            OrganError: the scene's number of substeps is too small for this organ; the loop keeps the previous one.
-            ValueError: an arm does not reach that position.
+            OrganError: too few substeps in the scene for this organ; the loop keeps the previous one.
+            ValueError: a position out of an arm's reach.
         """
         simulation = self.simulation
         place = simulation.instrument.parked if tip_position is None else np.asarray(tip_position, dtype=np.float64)
@@ -469,10 +467,10 @@ class HapticLoop:
             held.restart()
 
     def _hold_breath(self) -> None:
-        """Hold the breath while a device's button does; a device without a pose asks for nothing."""
-        asked = [held.holds_breath for held in self.held]
-        if any(one is not None for one in asked):
-            self.simulation.hold_breath(any(asked))
+        """Hold the breath while a device's button is pressed; a device without a pose is ignored."""
+        requests = [held.holds_breath for held in self.held]
+        if any(request is not None for request in requests):
+            self.simulation.hold_breath(any(requests))
 
     def _contact_forces(self) -> list[FloatArray]:
         wrench = self.simulation.contact_wrench

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 # Width [s] and number of the histogram classes of lateness and durations; the last class is open.
 CLASS_WIDTH = 20e-6
 CLASS_COUNT = 1001
-# The process sleeps until this long before a step is due [s], and then polls the clock.
+# The process sleeps until this time before a due step [s], and then polls the clock.
 SPIN = 120e-6
 # It does not sleep if steps take more than this share of their period: a core is slow after sleeping, with cold caches
 # (a step of the liver took 0.71 instead of 0.53 ms on 2 cores of a virtual machine).
@@ -35,7 +35,7 @@ class PaceSettings:
 
     Args:
         period: of the steps [s].
-        behind_most: lateness above which steps are skipped and counted [s].
+        behind_most: largest lateness before steps are skipped and counted [s].
     """
 
     period: float = 0.001
@@ -50,10 +50,10 @@ class PaceSettings:
 
 
 class Pacer:
-    """Starts each step when it is due; late steps start at once until they have caught up.
+    """Starts of steps at their due times; late steps start at once until they have caught up.
 
-    The lateness of a step is the time from when it was due to its start. Steps more than `behind_most` late are skipped
-    and counted in `skipped`; simulated time then falls behind the clock.
+    The lateness of a step is its start less its due time. Steps more than `behind_most` late are skipped and counted in
+    `skipped`; simulated time then falls behind the clock.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Pacer:
         self._due += period
 
     def done(self, simulated: float) -> None:
-        """Count a finished step that advanced the simulation by `simulated` [s]."""
+        """Count a finished step of `simulated` [s] of the simulation."""
         spent = self._clock() - self._began
         self._sleepy = spent < SLEEP_SHARE * self.settings.period
         self._spent[min(int(spent / CLASS_WIDTH), CLASS_COUNT - 1)] += 1
@@ -131,8 +131,8 @@ class Timeliness:
 def timeliness(before: NDArray, after: NDArray, wall: float) -> Timeliness:
     """Timing between two copies of a TIMING record, `wall` [s] of wall-clock time apart.
 
-    `late_most` is the upper end of the highest class with a step, or, if that is the open class, the largest lateness
-    since the process started.
+    `late_most` is the upper end of the highest class with a step, or, for the open class, the largest lateness since
+    the process started.
     """
     late, spent = after["late"] - before["late"], after["spent"] - before["spent"]
     return Timeliness(

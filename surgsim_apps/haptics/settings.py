@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from surgsim_apps.haptics.coupling import VirtualCoupling
 from surgsim_apps.haptics.device import require_positive
 
-# The bits of a device's buttons that close a jaw, and that hold the breath in `surgsim haptics` and `surgsim view`.
+# Bits of a device's buttons: close a jaw; hold the breath (in `surgsim haptics` and `surgsim view`).
 JAW_BIT, BREATH_BIT = 0, 1
 
 
@@ -14,20 +14,20 @@ class HapticSettings:
     """Configuration of the coupling of one device to one tip.
 
     Args:
-        coupling: None: the one that `coupling_for` computes for the device.
+        coupling: None: that of `coupling_for` for the device.
         force_largest: of the coupling [N], on tip and device; chosen below the 3.3 N of small desktop devices.
         slew_largest: of the device's force [N/s]; chosen: a coupling of 800 N/m moved at 0.6 m/s.
-        timeout: time without a fresh pose after which the force fades [s].
+        timeout: time without a fresh pose until the force fades [s].
         fade: time from full force to none, linearly [s].
         resume: time from none to full force when poses return, linearly [s].
-        relative: whether the device's first pose after a reset corresponds to the tip's position; otherwise its poses
+        relative: True if the device's first pose after a reset corresponds to the tip's position; otherwise its poses
             are positions in the scene.
-        smoothing: time constant of a filter on the poses [s]; None: 0 for a device that exerts forces, where it counts
-            as lag, and 20 ms for one that does not, whose poses may arrive only 30 times a second.
+        smoothing: time constant of a filter on the poses [s]; None: 0 for a device with force feedback, for which it
+            counts as lag, else 20 ms, since poses may arrive only 30 times a second.
         approach_speed: speed of the tip on its way to a distant device [m/s].
         speed_largest: speed limit of the tip [m/s]; chosen above careful hand motions.
-        breath_button: bit of `DevicePose.buttons` that holds the breath of a patient who breathes while it is pressed;
-            None: none, and the breath stays as `Simulation.hold_breath` has it.
+        breath_button: bit of `DevicePose.buttons` for holding a patient's breath; None: none, and the breath follows
+            `Simulation.hold_breath` alone.
 
     Raises:
         ValueError: names the entry, its value and the rule.

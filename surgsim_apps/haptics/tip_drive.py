@@ -7,12 +7,12 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.coupling import TipDynamics
 from surgsim_env.instruments import SIDES, ArmInstrument, Instrument, Pair, SteeredArm
 
-# Mass [kg] and damping [N s/m] of the point that an arm follows: as heavy as a probe, and damped by more than the
-# energy that tissue of 100 N/m with a lag of 20 ms feeds in.
+# Mass [kg] and damping [N s/m] of the point before an arm: as heavy as a probe, and damped by more than the energy fed
+# in by tissue of 100 N/m with a lag of 20 ms.
 STEERED = TipDynamics(mass=0.15, damping=4.0)
 # Haptic steps per solution of an arm's inverse kinematics, which takes 0.3 ms.
 STEER_EVERY = 10
-# Time constant with which an arm follows the point [s].
+# Time constant of an arm after the point [s].
 STEER_TIME = 0.02
 
 
@@ -29,11 +29,11 @@ class CartesianDrive:
     Fields:
         tool: the instrument
         dynamics: mass and damping at the coupling
-        force_largest: largest force that it can exert [N]
+        force_largest: its largest force [N]
     """
 
     def __init__(self, instrument: Instrument) -> None:
-        """Drive an instrument whose servo's first three joints are slides along x, y and z."""
+        """Drive an instrument with slides along x, y and z as the servo's first three joints."""
         model, servo = instrument.model, instrument.servo
         self.tool = instrument
         hold, pace = servo.position[:3], servo.speed[:3]
@@ -52,16 +52,16 @@ class CartesianDrive:
 
     @property
     def position(self) -> FloatArray:
-        """The tip, to which the coupling is attached [m], (3,); up to date after `Instrument.refresh`."""
+        """The tip, the coupling's end [m], (3,); up to date after `Instrument.refresh`."""
         return self.tool.tip_position
 
     @property
     def limited(self) -> bool:
-        """Whether the tip's box stops it."""
+        """True if the tip's box stops it."""
         return self.tool.workspace_limited
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
-        """Command the speed at which the servo exerts a force [N], (3,); the simulation adds the tissue's."""
+        """Command the speed for a servo force [N], (3,); the simulation adds the tissue's."""
         data = self.tool.data
         lead = data.ctrl[self._hold] - data.qpos[self._place]
         speed = data.qvel[self._speed]
@@ -72,7 +72,7 @@ class CartesianDrive:
 
 
 class SteeredDrive:
-    """The tip of an arm: it follows a point of 150 g on which the forces of coupling and tissue act.
+    """The tip of an arm: it follows a point of 150 g under the forces of coupling and tissue.
 
     m dv/dt = F + F_tissue - b v at haptic rate; the arm's inverse kinematics follow at a tenth of it. `stiffness_limit`
     does not include that lag: its guarantee is for tips on slides.
@@ -93,16 +93,16 @@ class SteeredDrive:
 
     @property
     def position(self) -> FloatArray:
-        """The point that the arm follows, to which the coupling is attached [m], (3,)."""
+        """The point before the arm, the coupling's end [m], (3,)."""
         return self._place
 
     @property
     def limited(self) -> bool:
-        """Whether the box, a joint limit or a speed limit stops the tip."""
+        """True if the box, a joint limit or a speed limit stops the tip."""
         return self.tool.limited
 
     def push(self, force: FloatArray, contact_force: FloatArray) -> None:
-        """Move the point by one haptic step under two forces [N], (3,), and steer the arm when it is its turn."""
+        """Move the point by one haptic step under two forces [N], (3,), and steer the arm in its turn."""
         dt, steered = self._haptic_step, self.tool
         push = force + contact_force + self.dynamics.mass / dt * self._velocity
         self._velocity = push / (self.dynamics.mass / dt + self.dynamics.damping)

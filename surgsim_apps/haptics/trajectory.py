@@ -1,4 +1,4 @@
-"""A device that plays the recorded motion of a hand."""
+"""Playback of a recorded motion as a haptic device."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +15,9 @@ ROUNDING = 1e-3
 
 
 class TrajectoryDevice:
-    """Plays positions over time, interpolated linearly, one haptic step per `read`; forces are stored.
+    """Positions over time, interpolated linearly, one haptic step per `read`; forces are stored.
 
-    In a row without a place it gives no pose.
+    A row without a place gives no pose.
 
     Fields:
         force: the last one written [N]                                    (3,)
@@ -60,7 +60,7 @@ class TrajectoryDevice:
 
     @property
     def over(self) -> bool:
-        """Whether the last row has been played."""
+        """True after the last row."""
         return self._time[0] + self._step * self._haptic_step > self._time[-1]
 
     def read(self) -> DevicePose | None:

@@ -1,7 +1,4 @@
-"""A device behind a UDP socket on this machine, such as a client of OpenHaptics, CHAI3D or ROS.
-
-`docs/haptics.md` has the table of the two packets.
-"""
+"""A device behind a UDP socket on this machine, such as a client of OpenHaptics, CHAI3D or ROS (docs/haptics.md)."""
 
 import math
 import socket
@@ -21,17 +18,17 @@ PORT = 47801
 MAGIC = b"SSHP"
 VERSION = 1
 KIND_POSE, KIND_FORCE = 1, 2
-# Little-endian, without gaps. Magic, version, kind, buttons (0 of a force), sequence, time (of a force those of the
-# pose that it answers); position or force.
+# Little-endian, without gaps. Magic, version, kind, buttons (0 of a force), sequence, time (of a force those of its
+# pose); position or force.
 PACKET = struct.Struct("<4sBBHId3d")
 
 # Positions farther from the device's origin are refused [m].
 POSITION_LARGEST = 10.0
-# Time without poses after which another sender may attach [s].
+# Time without poses until another sender may attach [s].
 PEER_TIMEOUT = 1.0
 # Packets read per haptic step; the socket drops a flood of more.
 PACKETS_PER_READ = 16
-# Receive buffer of the socket [bytes]: a few tens of packets, so that a flood leaves no old ones.
+# Receive buffer of the socket [bytes]: a few tens of packets; a flood leaves no old ones.
 BUFFER_SIZE = 16384
 
 
@@ -65,7 +62,7 @@ def unpack_pose(data: bytes) -> PosePacket | None:
 
 
 def newer(sequence: int, last: int) -> bool:
-    """Whether a sequence number comes after another, modulo 2^32 (RFC 1982)."""
+    """True if a sequence number comes after another, modulo 2^32 (RFC 1982)."""
     return 0 < (sequence - last) % 2**32 < 2**31
 
 
@@ -91,10 +88,10 @@ class UdpCounts:
 
 
 class UdpDevice:
-    """Listens on 127.0.0.1, as packets are not authenticated; the sender of the first valid packet is attached.
+    """A device on 127.0.0.1, as packets are not authenticated; the sender of the first valid packet is attached.
 
     Each pose is answered by one force, a packet of the same size; nothing else is sent. If the attached sender sends no
-    new valid pose for PEER_TIMEOUT, the next sender of one is attached, maybe the same one with new sequence numbers.
+    new valid pose for PEER_TIMEOUT, the next valid pose attaches its sender, maybe the same with new sequence numbers.
 
     Fields:
         counts: numbers of packets so far

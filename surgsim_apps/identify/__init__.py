@@ -1,1 +1,1 @@
-"""Recorded presses on tissue, and the material of this organ that describes them: `surgsim identify`."""
+"""Identification of materials from recorded presses on tissue: `surgsim identify`."""

@@ -1,4 +1,4 @@
-"""From recorded sets to one material, its errors on held-out sites, and what the data cannot tell."""
+"""Identification of a material from recorded sets, with errors on held-out sites and warnings."""
 
 import math
 import time
@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.identify.press_model import PressCurve, PressSetting, PressShape
@@ -19,8 +18,8 @@ from surgsim_apps.identify.shape_search import (
     ROUND_COUNT,
     ROUNDS,
     STANDARD_ERRORS,
-    FoundShape,
     PressLibrary,
+    ShapeFit,
     ShapeSpace,
     find_linear,
     find_shape,
@@ -35,24 +34,25 @@ from surgsim_apps.identify.site_fit import (
     fit_sites,
     sort_out,
 )
+from surgsim_env.step_progress import StepProgress
 
-# Fewest usable sites of a set: with fewer, half of them tells nothing of the other half.
+# Fewest usable sites of a set, of which half judge the other half.
 SITES_LEAST = 6
-# Poisson's ratios that are tried beside the one given.
+# Poisson's ratios beside the given one.
 OTHER_RATIOS = (0.40, 0.48)
-# Held presses that tell relaxation at least, in each half.
+# Fewest held presses for relaxation, in each half.
 HELD_LEAST = 2
 
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """What is known of the recordings, and how they are divided.
+    """Known facts about the recordings, and their division.
 
     Args:
         ball_radius: [m].
         thickness: of the tissue on its rigid bed [m]; None: searched.
         poisson_ratio: of the tissue.
-        seed: draws the halves of the sites.
+        seed: of the halves of the sites.
 
     Raises:
         ValueError: names the field, its value and its range.
@@ -81,21 +81,21 @@ class ForceError:
 
     @classmethod
     def of(cls, fits: SiteFits) -> "ForceError":
-        """The error of fitted sites."""
+        """Error of fitted sites."""
         errors = fits.deep_errors
         return cls(float(np.median(errors)), float(np.percentile(errors, 90.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class SetResult:
-    """One set after the identification.
+    """Result of a set.
 
     Fields:
         recording: the set
-        left_out: sites that are not used, by reason
+        left_out: unusable sites, by reason
         fits: modulus, offset and force of every usable site with the identified shape
         linear_fits: the same with the best linear tissue
-        is_training: which of the usable sites chose the shape, (n_site,)
+        is_training: true for usable sites of the training half, (n_site,)
         error, linear_error: on the held-out sites
     """
 
@@ -113,20 +113,20 @@ class Identification:
     """Result of `identify`.
 
     Fields:
-        options: what was given
+        options: as given
         sets: one per recording
-        found, linear: the shape with its intervals; the best linear one
-        is_linear: whether linear tissue describes the training sites as well, so that the material has no stiffening
-        curve, linear_curve: their presses
-        relaxation: arms, where presses were held; relative moduli are those of the springs
-        other_ratios: for each other Poisson's ratio: error on the training sites, and factor on the modulus
-        warnings: what the data cannot tell, one sentence each
+        best, linear: best shape with its intervals; best linear shape
+        is_linear: true if linear tissue describes the training sites as well: the material has no stiffening
+        curve, linear_curve: presses of the identified and of the linear shape
+        relaxation: arms by held presses, with the relative moduli of the springs
+        other_ratios: error on the training sites and factor on the modulus for other Poisson's ratios
+        warnings: limits of the data and of the identification, a sentence each
         seconds: wall time
     """
 
     options: IdentifyOptions
     sets: tuple[SetResult, ...]
-    found: FoundShape
+    best: ShapeFit
     linear: PressShape
     is_linear: bool
     curve: SampledCurve
@@ -139,19 +139,19 @@ class Identification:
     @property
     def shape(self) -> PressShape:
         """The identified shape."""
-        return self.linear if self.is_linear else self.found.shape
+        return self.linear if self.is_linear else self.best.shape
 
     @property
     def moduli(self) -> FloatArray:
         """Moduli of all usable sites of all sets [Pa]."""
-        return np.concatenate([one.fits.modulus for one in self.sets])
+        return np.concatenate([dataset.fits.modulus for dataset in self.sets])
 
 
 def make_library(recordings: Sequence[Recording], options: IdentifyOptions) -> PressLibrary:
-    """An empty library of presses, deep enough for these sets with their offsets."""
-    depth = (1.0 + OFFSET_SHARE) * max(depth_largest(sort_out(one.presses)[0]) for one in recordings)
+    """Empty library of presses, deep enough for sets with their offsets."""
+    depth = (1.0 + OFFSET_SHARE) * max(depth_largest(sort_out(recording.presses)[0]) for recording in recordings)
     if not depth > 0.0:
-        # No site can be used: `identify` says why.
+        # Without a usable site `identify` raises.
         depth = options.ball_radius
     setting = PressSetting(options.ball_radius, depth, options.poisson_ratio)
     return PressLibrary(ShapeSpace(options.ball_radius, depth, options.thickness), setting)
@@ -164,66 +164,62 @@ def identify(
     library: PressLibrary | None = None,
     console: Console | None = None,
 ) -> Identification:
-    """The material that describes one or more sets; they share thickness and law, each site has modulus and offset.
+    """Material of one or more sets, with common thickness and law, and modulus and offset of each site.
 
     Args:
         recordings: the sets.
-        options: what is known of them.
-        library: presses so far, shared by calls with the same options; None: made anew.
-        console: where the progress bar is shown; nowhere by default.
+        options: known facts about them.
+        library: presses so far, shared by calls with the same options; default: a new one.
+        console: for the progress; none by default.
 
     Raises:
-        ValueError: a set with too few usable sites; says how many are left out and why.
+        ValueError: a set with too few usable sites, with numbers and reasons of the others.
     """
     begin = time.perf_counter()
     library = make_library(recordings, options) if library is None else library
     sorted_sets = [sort_out(recording.presses) for recording in recordings]
     for recording, (usable, left_out) in zip(recordings, sorted_sets):
         if len(usable) < SITES_LEAST:
-            said = "; ".join(f"{len(sites)} with {reason}" for reason, sites in left_out.items()) or "there are no more"
+            reasons = "; ".join(f"{len(sites)} with {reason}" for reason, sites in left_out.items())
             raise ValueError(
-                f"recording {recording.name}: {len(usable)} of {len(recording.presses)} sites can be used ({said}); "
-                f"the rule is at least {SITES_LEAST}"
+                f"recording {recording.name}: {len(usable)} of {len(recording.presses)} sites can be used "
+                f"({reasons or 'there are no more'}); the rule is at least {SITES_LEAST}"
             )
-    columns = (TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     starting = 0 if library.linear_curves else library.start_count
-    held = [held_sites(usable) for usable, _ in sorted_sets]
-    rounds = 2 if all(len(sites) >= 2 * HELD_LEAST for sites in held) else 1
-    total = starting + rounds * ROUNDS * ROUND_COUNT + len(OTHER_RATIOS)
-    with Progress(*columns, console=console or Console(quiet=True), transient=True) as progress:
-        task = progress.add_task("pressing the model", total=total)
+    has_holds = all(len(held_sites(usable)) >= 2 * HELD_LEAST for usable, _ in sorted_sets)
+    total = starting + (2 if has_holds else 1) * ROUNDS * ROUND_COUNT + len(OTHER_RATIOS)
+    halves = [draw_halves(len(usable), options.seed) for usable, _ in sorted_sets]
+    samples = [SiteSamples.of(usable, OFFSET_SHARE * depth_largest(usable)) for usable, _ in sorted_sets]
+    relaxation = None
+    with StepProgress(console) as progress, progress.step("pressing the model", total) as advance:
 
-        def advanced() -> None:
-            progress.advance(task)
+        def advance_by_one() -> None:
+            advance(1)
 
         if starting:
-            library.start(advanced)
-        drawn = [draw_halves(len(usable), options.seed) for usable, _ in sorted_sets]
-        samples = _samples([usable for usable, _ in sorted_sets])
-        training = [part.subset(rows) for part, (rows, _) in zip(samples, drawn)]
-        linear, linear_curve = find_linear(library, training)
-        found = find_shape(library, training, seed=options.seed, progress=advanced)
-        is_linear = _is_linear(found, linear_curve, training)
-        relaxation = None
-        if rounds == 2:
-            # Arms also act while the ball moves: take them out of the forces, and search the shape again.
-            curve = linear_curve if is_linear else found.curve
-            relaxation = _relaxation(curve, sorted_sets, drawn)
-            samples = _without_arms(samples, curve, relaxation)
-            training = [part.subset(rows) for part, (rows, _) in zip(samples, drawn)]
+            library.start(advance_by_one)
+        while True:
+            training = [part.subset(rows) for part, (rows, _) in zip(samples, halves)]
             linear, linear_curve = find_linear(library, training)
-            found = find_shape(library, training, seed=options.seed, progress=advanced)
-            is_linear = _is_linear(found, linear_curve, training)
-            relaxation = _relaxation(linear_curve if is_linear else found.curve, sorted_sets, drawn)
-        shape, curve = (linear, linear_curve) if is_linear else (found.shape, found.curve)
-        other_ratios = _other_ratios(library, shape, curve, training, advanced)
+            best = find_shape(library, training, seed=options.seed, progress=advance_by_one)
+            is_linear = _is_linear(best, linear_curve, training)
+            shape, curve = (linear, linear_curve) if is_linear else (best.shape, best.curve)
+            if not has_holds:
+                break
+            is_second = relaxation is not None
+            relaxation = _relaxation(curve, sorted_sets, halves)
+            if is_second:
+                break
+            # Arms also act while the ball moves: the second search uses forces without them.
+            samples = _without_arms(samples, curve, relaxation)
+        other_ratios = _other_ratios(library, shape, curve, training, advance_by_one)
         if relaxation is not None:
             relaxation = _of_springs(library, shape, curve, relaxation)
     sets = []
-    for recording, (_, left_out), part, (trained, held_out) in zip(recordings, sorted_sets, samples, drawn):
+    for recording, (_, left_out), part, (trained, held_out) in zip(recordings, sorted_sets, samples, halves):
         is_training = np.isin(np.arange(len(part)), trained)
-        rest = part.subset(held_out)
-        error, linear_error = (ForceError.of(fit_sites(one, rest)) for one in (curve, linear_curve))
+        others = part.subset(held_out)
+        error, linear_error = (ForceError.of(fit_sites(press, others)) for press in (curve, linear_curve))
         sets.append(
             SetResult(
                 recording, left_out, fit_sites(curve, part), fit_sites(linear_curve, part), is_training, error,
@@ -231,20 +227,16 @@ def identify(
             )
         )  # fmt: skip
     result = Identification(
-        options, tuple(sets), found, linear, is_linear, curve, linear_curve, relaxation, other_ratios, (),
+        options, tuple(sets), best, linear, is_linear, curve, linear_curve, relaxation, other_ratios, (),
         time.perf_counter() - begin,
     )  # fmt: skip
     return replace(result, warnings=tuple(_warnings(result, library)))
 
 
-def _samples(usable: Sequence[Sequence[SitePress]]) -> list[SiteSamples]:
-    return [SiteSamples.of(sites, OFFSET_SHARE * depth_largest(sites)) for sites in usable]
-
-
-def _is_linear(found: FoundShape, linear_curve: SampledCurve, training: Sequence[SiteSamples]) -> bool:
-    """Whether stiffening does not lower the errors of the training sites, paired by site, by STANDARD_ERRORS."""
+def _is_linear(best: ShapeFit, linear_curve: SampledCurve, training: Sequence[SiteSamples]) -> bool:
+    """True if stiffening lowers the errors of the training sites by less than STANDARD_ERRORS, paired by site."""
     gain = np.concatenate(
-        [fit_sites(linear_curve, part).site_errors - fit_sites(found.curve, part).site_errors for part in training]
+        [fit_sites(linear_curve, part).site_errors - fit_sites(best.curve, part).site_errors for part in training]
     )
     return bool(gain.mean() <= STANDARD_ERRORS * gain.std(ddof=1) / math.sqrt(len(gain)))
 
@@ -252,11 +244,11 @@ def _is_linear(found: FoundShape, linear_curve: SampledCurve, training: Sequence
 def _relaxation(
     curve: SampledCurve,
     sorted_sets: Sequence[tuple[list[SitePress], dict[str, list[int]]]],
-    drawn: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
+    halves: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
 ) -> RelaxationFit:
     """Arms from the held presses of all sets."""
     training, held_out = (
-        held_sites([usable[row] for (usable, _), halves in zip(sorted_sets, drawn) for row in halves[half]])
+        held_sites([usable[row] for (usable, _), rows in zip(sorted_sets, halves) for row in rows[half]])
         for half in (0, 1)
     )
     offsets = np.linspace(0.0, OFFSET_SHARE * max(depth_largest(usable) for usable, _ in sorted_sets), 31)
@@ -264,7 +256,7 @@ def _relaxation(
 
 
 def _without_arms(samples: Sequence[SiteSamples], curve: SampledCurve, relaxation: RelaxationFit) -> list[SiteSamples]:
-    """The samples with forces as they would be without arms, F A / (A with arms), by the curve found so far."""
+    """Samples with forces less the arms' part, F A / (A with arms), by a curve."""
     arms = Arms(relaxation.relative_moduli, relaxation.times)
     cleaned = []
     for part in samples:
@@ -286,26 +278,26 @@ def _without_arms(samples: Sequence[SiteSamples], curve: SampledCurve, relaxatio
 def _other_ratios(
     library: PressLibrary, shape: PressShape, curve: SampledCurve, training: Sequence[SiteSamples], advanced
 ) -> dict[float, tuple[float, float]]:
-    """For other Poisson's ratios: median error on the training sites, and factor on the modulus."""
-    found = {}
+    """Median error on the training sites and factor on the modulus for other Poisson's ratios."""
+    results = {}
     own = np.concatenate([fit_sites(curve, part).modulus for part in training])
     for ratio in OTHER_RATIOS:
         other = replace(library, setting=replace(library.setting, poisson_ratio=ratio))
         (press,) = other.press([shape], advanced)
         if isinstance(press, PressCurve):
             fits = [fit_sites(library.sampled(press), part) for part in training]
-            errors = np.concatenate([one.deep_errors for one in fits])
-            moduli = np.concatenate([one.modulus for one in fits])
-            found[ratio] = float(np.median(errors)), float(np.median(moduli / own))
-    return found
+            errors = np.concatenate([fit.deep_errors for fit in fits])
+            moduli = np.concatenate([fit.modulus for fit in fits])
+            results[ratio] = float(np.median(errors)), float(np.median(moduli / own))
+    return results
 
 
 def _of_springs(
     library: PressLibrary, shape: PressShape, curve: SampledCurve, relaxation: RelaxationFit
 ) -> RelaxationFit:
-    """Relative moduli of the springs from those of the force: the volume term is elastic, and bears a part of it.
+    """Relative moduli of the springs from those of the force, of which the elastic volume term bears a part.
 
-    With springs gamma times as stiff and the same volume term, the force is gamma^p times as large; p from one press.
+    Springs gamma times as stiff with the same volume term raise the force gamma^p times; p from a press.
     """
     gain = 1.0 + math.fsum(relaxation.relative_moduli)
     if gain == 1.0:
@@ -322,47 +314,52 @@ def _of_springs(
     force = float(np.median(modulus * library.sampled(press).at(depths) / curve.at(depths)))
     power = math.log(force) / math.log(gain)
     share = (gain ** (1.0 / power) - 1.0) / (gain - 1.0)
-    return replace(relaxation, relative_moduli=tuple(share * one for one in relaxation.relative_moduli))
+    return replace(relaxation, relative_moduli=tuple(share * modulus for modulus in relaxation.relative_moduli))
 
 
 def _warnings(result: Identification, library: PressLibrary) -> list[str]:
-    """What the data cannot tell, and what the identification could not do, one sentence each."""
-    said = []
+    """Limits of the data and of the identification, a sentence each."""
+    warnings = []
+    intervals = result.best.intervals
     if result.is_linear:
-        said.append(
-            "stiffening is not told: linear tissue describes the training sites as well; the material has no stiffening"
+        warnings.append(
+            "stiffening is not identifiable: linear tissue describes the training sites as well; the material has no "
+            "stiffening"
         )
     else:
-        for name, one in result.found.intervals.items():
-            if not one.told:
-                low, high = (1e3 * one.low, 1e3 * one.high) if name == "thickness" else (one.low, one.high)
-                unit = " mm" if name == "thickness" else ""
-                said.append(
-                    f"{name} is not told: values from {low:.3g} to {high:.3g}{unit} describe the sites as well, with "
-                    "other values of the rest"
+        for name, interval in intervals.items():
+            if not interval.is_identifiable:
+                scale, unit = (1e3, " mm") if name == "thickness" else (1.0, "")
+                warnings.append(
+                    f"{name} is not identifiable: values from {scale * interval.low:.3g} to "
+                    f"{scale * interval.high:.3g}{unit} describe the sites as well, with other values of the rest"
                 )
-        if "thickness" in result.found.intervals:
-            one = result.found.intervals["thickness"]
-            said.append(
-                f"thickness ({1e3 * one.low:.3g} to {1e3 * one.high:.3g} mm describe the sites as well) and stiffening "
-                "stand for each other: measure the thickness and give --thickness"
+        if "thickness" in intervals:
+            interval = intervals["thickness"]
+            warnings.append(
+                f"thickness ({1e3 * interval.low:.3g} to {1e3 * interval.high:.3g} mm describe the sites as well) and "
+                "stiffening stand for each other: measure the thickness and give --thickness"
             )
-        if result.found.intervals["tangent_cap"].high > 0.95 * CAP_RANGE[1]:
-            said.append(
+        if intervals["tangent_cap"].high > 0.95 * CAP_RANGE[1]:
+            warnings.append(
                 f"the interval of tangent_cap ends with the range searched ({CAP_RANGE[1]:g}): a higher cap may do as "
                 "well"
             )
     for ratio, (error, factor) in result.other_ratios.items():
-        said.append(
+        warnings.append(
             f"poisson_ratio is given, not fitted ({result.options.poisson_ratio:g}): with {ratio:g} the training error "
             f"is {error:.1%} and moduli are {factor:.2f} times as large"
         )
-    for one in result.sets:
-        for reason, sites in one.left_out.items():
-            said.append(f"{one.recording.name}: {len(sites)} sites are left out, with {reason}: {_listed(sites)}")
+    for dataset in result.sets:
+        for reason, sites in dataset.left_out.items():
+            warnings.append(
+                f"{dataset.recording.name}: {len(sites)} sites are left out, with {reason}: {_listed(sites)}"
+            )
     if library.failed:
-        said.append(f"{len(library.failed)} presses of the model failed and are not considered: {library.failed[0]}")
-    return said
+        warnings.append(
+            f"{len(library.failed)} presses of the model failed and are not considered: {library.failed[0]}"
+        )
+    return warnings
 
 
 def _listed(sites: Sequence[int]) -> str:

@@ -1,7 +1,7 @@
-"""The forward model: force over depth of a ball that is pressed, quasi-statically, into a block of this organ's tissue.
+"""Forward model: force over depth of a ball pressed quasi-statically into a block of tissue.
 
-The block lies bonded on a rigid bed, and the ball slides on it without friction. Its curve is proportional to Young's
-modulus where thickness, Poisson's ratio and law are the same, so that one run per shape serves every site.
+The block is bonded to a rigid bed, and the ball slides on it without friction. For a given thickness, Poisson's ratio
+and law the force is proportional to Young's modulus: a run per shape serves every site.
 """
 
 import math
@@ -25,24 +25,24 @@ from msdm_core.organ import (
     stable_dt,
 )
 
-# Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], which a static press does not feel.
+# Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], without influence on a static press.
 MODULUS, DENSITY = 1000.0, 1000.0
 # Pressure per penetration over E [1/m]: a pressure of E leaves a gap of 17 um.
 CONTACT_STIFFNESS = 6e4
-# Cells to a radius of the ball, half the width of the block in such radii, and the thickness in such radii up to which
-# all cells are fine; below, they may be twice as long.
+# Cells to a radius of the ball, half the width of the block in radii, and depth of fine cells in radii; cells below may
+# be twice as long.
 CELLS_TO_RADIUS, HALF_WIDTH, FINE_DEPTH = 4, 2.75, 1.5
-# Depths at which the ball is held, denser where the contact is small.
+# Depths of held presses, denser for small contacts.
 KNOT_COUNT, KNOT_POWER = 18, 1.4
-# Substep over the stable step of the organ at rest; pressed deeply it is stiffer.
+# Substep over the stable step at rest; a deeply pressed organ is stiffer.
 STEP_SHARE = 0.8
-# Substeps in slow periods of the block: for moving from one depth to the next, for holding, for reading the force.
+# Durations in slow periods of the block: of the move to the next depth and of the hold; share of it for the reading.
 MOVE_PERIODS, HOLD_PERIODS, READ_SHARE = 0.12, 0.45, 0.05
 
 
 @dataclass(frozen=True)
 class PressSetting:
-    """What a press is made with: radius of the ball [m], largest depth [m], Poisson's ratio of the tissue.
+    """Setting of a press: radius of the ball [m], largest depth [m], Poisson's ratio of the tissue.
 
     Raises:
         ValueError: names the field, its value and its range.
@@ -66,10 +66,7 @@ class PressSetting:
 
 @dataclass(frozen=True)
 class PressShape:
-    """What gives a force-depth curve its shape: thickness of the tissue [m] and the law of its springs.
-
-    A tangent_cap of 1 is the linear law, whatever the strains.
-    """
+    """Shape of a force-depth curve: thickness of the tissue [m] and law of its springs, linear for a cap of 1."""
 
     thickness: float
     onset_strain: float = 0.0
@@ -77,7 +74,7 @@ class PressShape:
     tangent_cap: float = 1.0
 
     def material(self, youngs_modulus: float, poisson_ratio: float) -> Material:
-        """The tissue with a modulus [Pa]."""
+        """Tissue with a modulus [Pa]."""
         law = None
         if self.tangent_cap > 1.0:
             law = Stiffening(float(self.onset_strain), float(self.cap_strain), float(self.tangent_cap))
@@ -101,17 +98,17 @@ class PressCurve:
     def at(self, depth: FloatArray) -> FloatArray:
         """Force over modulus at depths [m^2]; 0 above the surface, not finite beyond the largest depth.
 
-        Between the knots (F / E)^(2/3), which is straight for Hertz, by a monotone cubic.
+        Between the knots (F / E)^(2/3), straight for Hertz, follows a monotone cubic.
         """
         smooth = PchipInterpolator(self.depth, self.area ** (2.0 / 3.0), extrapolate=False)
         return np.maximum(smooth(np.maximum(depth, 0.0)), 0.0) ** 1.5
 
 
 def press_block(shape: PressShape, setting: PressSetting, *, cells_to_radius: float = CELLS_TO_RADIUS) -> PressCurve:
-    """Press the ball into the middle of a block, hold it at each depth until it is at rest, read the force.
+    """Curve of a ball pressed into the middle of a block and held at each depth until rest.
 
     Raises:
-        ValueError: the block faults at some depth; says at which, and the way out.
+        ValueError: the block faults; says at which depth, and the way out.
     """
     model, top = _block(shape, setting, cells_to_radius)
     law = ContactLaw(CONTACT_STIFFNESS * MODULUS, 0.0, 0.0, 0.0)
@@ -147,10 +144,9 @@ def press_block(shape: PressShape, setting: PressSetting, *, cells_to_radius: fl
 
 def _block(shape: PressShape, setting: PressSetting, cells_to_radius: float) -> tuple[OrganModel, FloatArray]:
     """The block, and the point in the middle of its top [m]."""
-    wanted = setting.ball_radius / cells_to_radius
     fine = FINE_DEPTH * setting.ball_radius
     coarsening = 1 if shape.thickness < 1.3 * fine else 2
-    layers = max(2, coarsening * round(shape.thickness / (wanted * coarsening)))
+    layers = max(2, coarsening * round(shape.thickness / (setting.ball_radius / cells_to_radius * coarsening)))
     cell = shape.thickness / layers
     across = 4 * math.ceil(HALF_WIDTH * setting.ball_radius / (2.0 * cell))
     size = (across * cell, across * cell, shape.thickness)
@@ -168,21 +164,19 @@ def _block(shape: PressShape, setting: PressSetting, cells_to_radius: float) -> 
 
 
 def _even_mass(model: OrganModel, law: ContactLaw, top: FloatArray, setting: PressSetting) -> OrganModel:
-    """The block with mass added to the nodes that the ball can reach, so that contact does not shorten the step.
+    """The block with mass added to nodes in reach of the ball, for contact without a shorter step.
 
-    A static press does not feel mass.
+    Mass has no influence on a static press.
     """
     distance = np.linalg.norm(model.node_rest_position - top, axis=1)
     near = distance < 1.6 * setting.ball_radius
-    held = np.where(near, law.stiffness * contact_node_area(model), 0.0)
-    mass = model.node_mass + 0.5 * held * model.stable_step**2
+    contact = np.where(near, law.stiffness * contact_node_area(model), 0.0)
+    mass = model.node_mass + 0.5 * contact * model.stable_step**2
     inverse = np.where(model.node_inverse_mass > 0.0, 1.0 / mass, 0.0)
-    for array in (mass, inverse):
-        array.setflags(write=False)
     reachable = near[model.surface_triangles].all(axis=1)
     triangles = np.ascontiguousarray(model.surface_triangles[reachable])
     areas = np.ascontiguousarray(model.surface_rest_area[reachable])
-    for array in (triangles, areas):
+    for array in (mass, inverse, triangles, areas):
         array.setflags(write=False)
     return model._replace(
         node_mass=mass, node_inverse_mass=inverse, surface_triangles=triangles, surface_rest_area=areas

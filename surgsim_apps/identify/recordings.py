@@ -1,16 +1,16 @@
 """Recorded presses of a ball on tissue, read from CSV files and checked.
 
-A file is one set: one sample of tissue, one ball, sites that were pressed one after the other. Columns, in any order:
+A file is one set: one sample of tissue, one ball, sites pressed one after the other. Columns, in any order:
 
 | column | unit | meaning |
 |---|---|---|
 | `site` | | whole number of the site; its samples stand in the order of the press |
 | `depth_mm` | mm | travel of the ball along the surface normal since first contact |
-| `normal_force_n` | N | force along the normal, positive where the tissue is pressed |
-| `x_mm`, `y_mm`, `z_mm` | mm | optional, all three: where the ball was at first contact |
+| `normal_force_n` | N | force along the normal, positive in a press |
+| `x_mm`, `y_mm`, `z_mm` | mm | optional, all three: place of the ball at first contact |
 | `time_s` | s | optional: time of the sample, rising within a site |
 
-Further columns are read over.
+Further columns are ignored.
 """
 
 import csv
@@ -26,19 +26,19 @@ from msdm_core.mesh import FloatArray
 NEEDED = ("site", "depth_mm", "normal_force_n")
 PLACE = ("x_mm", "y_mm", "z_mm")
 TIME = "time_s"
-# Beyond any press on tissue: a depth [mm] or a force [N] above these is a wrong unit or a wrong column.
+# Beyond any press on tissue: a larger depth [mm] or force [N] is a wrong unit or a wrong column.
 DEPTH_MOST, FORCE_MOST = 100.0, 1000.0
-# A sample is at full depth from this share of the largest depth on: robots hold a depth with noise.
+# Least share of the largest depth at full depth: robots hold a depth with noise.
 FULL_DEPTH = 0.99
 
 
 @dataclass(frozen=True, eq=False)
 class SitePress:
-    """The samples of one press, in their order.
+    """Samples of a press, in their order.
 
     Fields:
         site: its number in the file
-        place: of the ball at first contact [m], (3,); not finite where the file does not tell
+        place: of the ball at first contact [m], (3,); not finite if not in the file
         depth: travel along the normal since first contact [m], (n_sample,)
         force: along the normal [N], (n_sample,)
         time: [s], (n_sample,), or None
@@ -52,29 +52,29 @@ class SitePress:
 
     @property
     def loading(self) -> slice:
-        """The samples up to the first at full depth: what follows is held or withdrawn."""
+        """Samples up to the first at full depth, before the hold and the withdrawal."""
         return slice(0, int(np.argmax(self.depth >= FULL_DEPTH * self.depth.max())) + 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A set of recorded presses: its name and the press of each site."""
+    """Set of recorded presses: its name and the press of each site."""
 
     name: str
     presses: tuple[SitePress, ...]
 
     @property
     def has_places(self) -> bool:
-        """Whether all sites have a place."""
+        """True if all sites have a place."""
         return all(np.isfinite(press.place).all() for press in self.presses)
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a set from a CSV file with the columns that this module lists.
+    """Read a set from a CSV file with the columns of this module.
 
     Raises:
-        ValueError: a file that cannot be read, a column or a number that is missing, wrong or beyond any press; names
-            the file, the line, the column, the value and the rule.
+        ValueError: an unreadable file; a column or a number that is missing, wrong or beyond any press, with file,
+            line, column, value and rule.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -93,7 +93,7 @@ def read_recording(path: Path) -> Recording:
         numbers = [_number(path, line, name, row, place) for name, place in columns.items()]
         samples.setdefault(_site(path, line, numbers[0]), []).append(numbers[1:])
     names = list(columns)[1:]
-    return Recording(path.stem, tuple(_press(path, site, names, found) for site, found in samples.items()))
+    return Recording(path.stem, tuple(_press(path, site, names, rows) for site, rows in samples.items()))
 
 
 def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:

@@ -1,8 +1,8 @@
-"""Relaxation of tissue from presses with times: Prony terms of a quasi-linear solid, by least squares.
+"""Relaxation of tissue by presses with times: Prony terms of a quasi-linear solid, by least squares.
 
-The force at a site is that of the elastic press plus one term per Maxwell arm (Fung 1993),
+The force at a site is that of the elastic press plus a term per Maxwell arm (Fung 1993),
 F(t) = E [A(t) + sum_i g_i int exp(-(t - s) / tau_i) dA/ds ds], with A(t) = A(d(t) + o) of `press_model`.
-After a step it starts at (1 + sum g_i) times the force at which it ends.
+After a step it starts at (1 + sum g_i) times its final value.
 """
 
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.identify.recordings import SitePress
 from surgsim_apps.identify.site_fit import SampledCurve
 
-# Arms that the organ's springs have at most, and by how much the error must fall for one more.
+# Most arms of the organ's springs, and least relative fall of the error for another arm.
 ARMS_MOST, GAIN_LEAST = 3, 0.05
-# Samples of a site that are used at most: half of the loading, half of the hold, there evenly in the logarithm of time.
+# Most samples of a site: half of the loading, half of the hold, evenly in the logarithm of time.
 SAMPLES_MOST = 160
-# Rounds of fitting the arms for given offsets, and offsets for given arms.
+# Rounds of fits of the arms for given offsets and of offsets for given arms.
 ROUNDS = 3
-# A set tells relaxation where presses are held for at least this share of their time.
+# Least held share of the time of a press that shows relaxation.
 HELD_SHARE_LEAST = 0.2
-# Relative moduli that are tried.
+# Range of relative moduli.
 MODULUS_LEAST, MODULUS_MOST = 1e-3, 10.0
 
 
@@ -35,7 +35,7 @@ class RelaxationFit:
         relative_moduli, times: as in the organ's material, times increasing
         error: median |F_model - F| / F over the samples from a third of the depth on
         elastic_error: the same without arms
-        time_range: shortest and longest time since the start of the press that the samples tell [s]
+        time_range: shortest and longest resolved time since the start of the press [s]
     """
 
     relative_moduli: tuple[float, ...]
@@ -46,7 +46,7 @@ class RelaxationFit:
 
 
 def held_sites(sites: Sequence[SitePress]) -> list[SitePress]:
-    """Sites with times that are held at depth long enough to tell relaxation."""
+    """Sites with times and a hold long enough for relaxation."""
     held = []
     for site in sites:
         if site.time is not None:
@@ -58,7 +58,7 @@ def held_sites(sites: Sequence[SitePress]) -> list[SitePress]:
 
 @dataclass(frozen=True, eq=False)
 class HeldSamples:
-    """Samples of held presses in rows as long as the longest; a row's last sample is repeated with weight 0.
+    """Samples of held presses in rows of equal length; a row's last sample is repeated with weight 0.
 
     Fields:
         depth, force, time: [m], [N], [s], (n_site, n_sample)
@@ -74,19 +74,19 @@ class HeldSamples:
 
     @classmethod
     def of(cls, sites: Sequence[SitePress]) -> "HeldSamples":
-        """The thinned samples of sites with times, offsets 0."""
+        """Thinned samples of sites with times, with offsets of 0."""
         rows = [_thinned(site) for site in sites]
-        count = max(len(one) for one in rows)
+        count = max(map(len, rows))
         table, weight = np.zeros((3, len(sites), count)), np.zeros((len(sites), count))
-        for number, (site, kept) in enumerate(zip(sites, rows)):
+        for number, (site, indices) in enumerate(zip(sites, rows)):
             assert site.time is not None
-            padded = np.concatenate([kept, np.full(count - len(kept), kept[-1])])
+            padded = np.concatenate([indices, np.full(count - len(indices), indices[-1])])
             table[:, number] = site.depth[padded], site.force[padded], site.time[padded] - site.time[0]
-            weight[number, : len(kept)] = 1.0
+            weight[number, : len(indices)] = 1.0
         return cls(table[0], table[1], table[2], weight, np.zeros(len(sites)))
 
     def force_model(self, curve: SampledCurve, offset: FloatArray, arms: "Arms") -> FloatArray:
-        """Model force of each sample, each site with its best modulus; offset [m] (n_site,), (n_site, n_sample) [N]."""
+        """Model force of samples (n_site, n_sample) [N] with the best modulus at each site; offset (n_site,) [m]."""
         area = arms.relaxed(curve.at(self.depth + offset[:, None]), self.time)
         own = (self.weight * area * area).sum(axis=1)
         modulus = (self.weight * area * self.force).sum(axis=1) / np.maximum(own, 1e-300)
@@ -98,8 +98,9 @@ class HeldSamples:
         return (self.force_model(curve, offset, arms) - self.force) * scale
 
     def with_offsets(self, curve: SampledCurve, arms: "Arms", offsets: FloatArray) -> "HeldSamples":
-        """The samples with the best of the offsets [m] at each site."""
-        squares = [(self.residual(curve, np.full(len(self.depth), one), arms) ** 2).sum(axis=1) for one in offsets]
+        """Samples with the best of the offsets [m] at each site."""
+        count = len(self.depth)
+        squares = [(self.residual(curve, np.full(count, offset), arms) ** 2).sum(axis=1) for offset in offsets]
         return HeldSamples(self.depth, self.force, self.time, self.weight, offsets[np.argmin(squares, axis=0)])
 
     def error(self, curve: SampledCurve, arms: "Arms") -> float:
@@ -117,7 +118,7 @@ class Arms:
     times: tuple[float, ...] = ()
 
     def relaxed(self, area: FloatArray, time: FloatArray) -> FloatArray:
-        """A(t) + sum g_i q_i(t), q_i = int exp(-(t - s) / tau_i) dA/ds ds for a path that is straight between samples.
+        """A(t) + sum g_i q_i(t), q_i = int exp(-(t - s) / tau_i) dA/ds ds, for a path straight between samples.
 
         q_n = a q_(n-1) + (1 - a) (tau / dt) (A_n - A_(n-1)), a = exp(-dt / tau), exact for straight pieces; at first
         q = A.
@@ -130,24 +131,24 @@ class Arms:
         rise = np.diff(area, axis=1)
         for modulus, tau in zip(self.moduli, self.times):
             step = np.maximum(np.diff(time, axis=1) / tau, 1e-12)
-            kept, gained = np.exp(-step), -np.expm1(-step) / step * rise
+            decay, gain = np.exp(-step), -np.expm1(-step) / step * rise
             response = area[:, 0].copy()
             total[:, 0] += modulus * response
             for place in range(rise.shape[1]):
-                response = kept[:, place] * response + gained[:, place]
+                response = decay[:, place] * response + gain[:, place]
                 total[:, place + 1] += modulus * response
         return total
 
     @classmethod
     def of(cls, logs: FloatArray) -> "Arms":
-        """From the logarithms of moduli and then times, in the order of the times."""
+        """Arms in the order of their times, from the logarithms of moduli and then times."""
         moduli, times = np.exp(logs).reshape(2, -1)
         order = np.argsort(times)
         return cls(tuple(moduli[order].tolist()), tuple(times[order].tolist()))
 
 
 def _thinned(site: SitePress) -> np.ndarray:
-    """Rows of a site's samples that are used."""
+    """Indices of the used samples of a site."""
     assert site.time is not None
     count, full = len(site.time), site.loading.stop - 1
     if count <= SAMPLES_MOST:
@@ -161,13 +162,13 @@ def _thinned(site: SitePress) -> np.ndarray:
 def fit_relaxation(
     curve: SampledCurve, training: Sequence[SitePress], held_out: Sequence[SitePress], offsets: FloatArray
 ) -> RelaxationFit:
-    """Arms that describe the held presses of the training sites; as many as lower the error by GAIN_LEAST each.
+    """Arms of the held presses of the training sites, as many as lower the error by GAIN_LEAST each.
 
     Args:
         curve: of the elastic press.
-        training: sites with times, whose samples choose the arms.
-        held_out: sites with times on which the error is reported; each has its own modulus and offset.
-        offsets: that are tried at each site [m].
+        training: sites with times, to fit the arms.
+        held_out: sites with times, for the error; each has its own modulus and offset.
+        offsets: candidates at each site [m].
     """
     samples, others = HeldSamples.of(training), HeldSamples.of(held_out)
     pieces = np.where(samples.weight[:, 1:] > 0.0, np.diff(samples.time, axis=1), np.inf)
@@ -192,7 +193,7 @@ def fit_relaxation(
 def _fitted_arms(
     curve: SampledCurve, samples: HeldSamples, count: int, time_range: tuple[float, float], offsets: FloatArray
 ) -> Arms:
-    """A number of arms by least squares of the force, with times within the range that the samples tell [s]."""
+    """Arms by least squares of the force, with times within the resolved range [s]."""
     shortest, longest = time_range
     logs = np.log(np.concatenate([np.full(count, 0.3), np.geomspace(shortest, longest, count + 2)[1:-1]]))
     low = np.log(np.repeat([MODULUS_LEAST, shortest], count))
@@ -200,7 +201,7 @@ def _fitted_arms(
     for _ in range(ROUNDS):
         placed = samples.with_offsets(curve, Arms.of(logs), offsets)
         logs = least_squares(
-            lambda one, placed=placed: placed.residual(curve, placed.offset, Arms.of(one)).ravel(),
+            lambda logs, placed=placed: placed.residual(curve, placed.offset, Arms.of(logs)).ravel(),
             np.clip(logs, low + 1e-6, high - 1e-6),
             bounds=(low, high),
             x_scale="jac",

@@ -27,7 +27,7 @@ COLUMNS = (
 DENSITY = 1060.0
 # Digits of numbers in files.
 DIGITS = 4
-# Sites whose curves are drawn one by one: at these quantiles of their errors.
+# Quantiles of the errors of sites with a curve of their own.
 SHOWN_QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
@@ -37,7 +37,7 @@ def rounded(value: float) -> float:
 
 
 def material_tables(result: Identification) -> dict[str, Any]:
-    """The table `material` of a scene file, with its sub-tables, as plain values."""
+    """Table `material` of a scene file, with its sub-tables, as plain values."""
     material: dict[str, Any] = {
         "youngs_modulus": rounded(float(np.median(result.moduli))),
         "density": DENSITY,
@@ -48,14 +48,14 @@ def material_tables(result: Identification) -> dict[str, Any]:
         material["stiffening"] = {name: rounded(getattr(result.shape, name)) for name in names}
     if result.relaxation is not None and result.relaxation.times:
         material["relaxation"] = {
-            "relative_moduli": [rounded(one) for one in result.relaxation.relative_moduli],
-            "times": [rounded(one) for one in result.relaxation.times],
+            "relative_moduli": [rounded(modulus) for modulus in result.relaxation.relative_moduli],
+            "times": [rounded(time) for time in result.relaxation.times],
         }
     return material
 
 
 def write_material(result: Identification, path: Path, command_line: str) -> None:
-    """Write the material as TOML: `[material]` with its sub-tables, to be put into any scene file."""
+    """Write the material as TOML, `[material]` with its sub-tables, for any scene file."""
     document = tomlkit.document()
     for line in _head(result, command_line):
         document.add(tomlkit.comment(line))
@@ -74,21 +74,21 @@ def _table(values: Mapping[str, Any], comments: Mapping[str, str]) -> TomlTable:
 
 
 def _head(result: Identification, command_line: str) -> list[str]:
-    """Comment lines at the top of the material: where it is from and how good it is."""
+    """Comment lines at the top of the material: its origin and its errors."""
     lines = [f"Written by: {command_line}"]
-    for one in result.sets:
+    for dataset in result.sets:
         lines.append(
-            f"{one.recording.name}: {len(one.fits.samples)} of {len(one.recording.presses)} sites, "
-            f"{int(one.is_training.sum())} of them chose the law; force error on the others {_shares(one)}"
+            f"{dataset.recording.name}: {len(dataset.fits.samples)} of {len(dataset.recording.presses)} sites, "
+            f"{int(dataset.is_training.sum())} of them chose the law; force error on the others {_shares(dataset)}"
         )
     lines.append(f"Thickness of the tissue in the model: {1e3 * result.shape.thickness:.3g} mm on a rigid bed.")
     return [*lines, *result.warnings]
 
 
-def _shares(one: SetResult) -> str:
+def _shares(dataset: SetResult) -> str:
     return (
-        f"{one.error.median:.1%} (median), {one.error.high:.1%} (90th percentile); "
-        f"linear tissue {one.linear_error.median:.1%}, {one.linear_error.high:.1%}"
+        f"{dataset.error.median:.1%} (median), {dataset.error.high:.1%} (90th percentile); "
+        f"linear tissue {dataset.linear_error.median:.1%}, {dataset.linear_error.high:.1%}"
     )
 
 
@@ -96,13 +96,13 @@ def _comments(result: Identification) -> dict[str, str]:
     low, high = np.percentile(result.moduli, [25.0, 75.0])
     comments = {
         "youngs_modulus": f"[Pa] median of {len(result.moduli)} sites; quartiles {low:.4g} to {high:.4g}",
-        "density": "[kg/m^3] of soft tissue, chosen: presses do not tell it",
+        "density": "[kg/m^3] of soft tissue, chosen: not identifiable by presses",
         "poisson_ratio": "given, not identified",
         "times": "[s]",
     }
-    for name, one in result.found.intervals.items():
-        told = "" if one.told else ", not told by the data"
-        comments[name] = f"{one.low:.3g} to {one.high:.3g} describe the sites as well{told}"
+    for name, interval in result.best.intervals.items():
+        doubt = "" if interval.is_identifiable else ", not identifiable"
+        comments[name] = f"{interval.low:.3g} to {interval.high:.3g} describe the sites as well{doubt}"
     return comments
 
 
@@ -111,58 +111,63 @@ def write_sites(result: Identification, path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(COLUMNS)
-        for one in result.sets:
-            errors, linear_errors = one.fits.site_errors, one.linear_fits.site_errors
-            for row, site in enumerate(one.fits.samples.sites):
+        for dataset in result.sets:
+            errors, linear_errors = dataset.fits.site_errors, dataset.linear_fits.site_errors
+            for row, site in enumerate(dataset.fits.samples.sites):
                 place = [f"{value:.6g}" if np.isfinite(value) else "" for value in site.place]
-                half = "training" if one.is_training[row] else "held out"
+                half = "training" if dataset.is_training[row] else "held out"
                 values = (
-                    *(one.fits.modulus[row], one.fits.offset[row], errors[row]),
-                    *(one.linear_fits.modulus[row], linear_errors[row]),
+                    *(dataset.fits.modulus[row], dataset.fits.offset[row], errors[row]),
+                    *(dataset.linear_fits.modulus[row], linear_errors[row]),
                 )
-                writer.writerow([one.recording.name, site.site, *place, half, *(f"{value:.6g}" for value in values)])
+                writer.writerow(
+                    [dataset.recording.name, site.site, *place, half, *(f"{value:.6g}" for value in values)]
+                )
 
 
 def summary(result: Identification, command_line: str) -> dict[str, Any]:
-    """The identification as plain values, for `summary.json`."""
+    """Plain values of an identification, for `summary.json`."""
     return {
         "command": command_line,
         "material": material_tables(result),
         "thickness": rounded(result.shape.thickness),
         "intervals": {
-            name: {"value": rounded(one.value), "low": rounded(one.low), "high": rounded(one.high), "told": one.told}
-            for name, one in result.found.intervals.items()
+            name: {
+                **{end: rounded(getattr(interval, end)) for end in ("value", "low", "high")},
+                "told": interval.is_identifiable,
+            }
+            for name, interval in result.best.intervals.items()
         },
         "linear": {"thickness": rounded(result.linear.thickness), "is_as_good": result.is_linear},
         "sets": {
-            one.recording.name: {
-                "sites": len(one.recording.presses),
-                "used": len(one.fits.samples),
-                "training": int(one.is_training.sum()),
-                "left_out": one.left_out,
-                "modulus_median": rounded(float(np.median(one.fits.modulus))),
-                "offset_median": rounded(float(np.median(one.fits.offset))),
-                "held_out_error": {"median": rounded(one.error.median), "high": rounded(one.error.high)},
+            dataset.recording.name: {
+                "sites": len(dataset.recording.presses),
+                "used": len(dataset.fits.samples),
+                "training": int(dataset.is_training.sum()),
+                "left_out": dataset.left_out,
+                "modulus_median": rounded(float(np.median(dataset.fits.modulus))),
+                "offset_median": rounded(float(np.median(dataset.fits.offset))),
+                "held_out_error": {"median": rounded(dataset.error.median), "high": rounded(dataset.error.high)},
                 "held_out_error_linear": {
-                    "median": rounded(one.linear_error.median),
-                    "high": rounded(one.linear_error.high),
+                    "median": rounded(dataset.linear_error.median),
+                    "high": rounded(dataset.linear_error.high),
                 },
             }
-            for one in result.sets
+            for dataset in result.sets
         },
         "relaxation": None
         if result.relaxation is None
         else {
             "held_out_error": rounded(result.relaxation.error),
             "held_out_error_elastic": rounded(result.relaxation.elastic_error),
-            "time_range": [rounded(one) for one in result.relaxation.time_range],
+            "time_range": [rounded(time) for time in result.relaxation.time_range],
         },
         "other_poisson_ratios": {
             f"{ratio:g}": {"training_error": rounded(error), "modulus_factor": rounded(factor)}
             for ratio, (error, factor) in result.other_ratios.items()
         },
         "warnings": list(result.warnings),
-        "press_count": result.found.press_count,
+        "press_count": result.best.press_count,
         "seconds": rounded(result.seconds),
     }
 
@@ -173,25 +178,25 @@ def write_summary(result: Identification, path: Path, command_line: str) -> None
 
 
 def error_table(sets: Sequence[SetResult]) -> Table:
-    """The errors of sets on held-out sites, beside those of the best linear tissue."""
+    """Errors of sets on held-out sites, beside the best linear tissue."""
     table = Table()
     for heading in ("set", "sites", "held out", "error", "90 %", "linear", "90 %", "E [kPa]", "offset [mm]"):
         table.add_column(heading, justify="left" if heading == "set" else "right", overflow="fold")
-    for one in sets:
+    for dataset in sets:
         table.add_row(
-            one.recording.name,
-            str(len(one.recording.presses)),
-            str(int((~one.is_training).sum())),
-            *(f"{value:.1%}" for value in (one.error.median, one.error.high)),
-            *(f"{value:.1%}" for value in (one.linear_error.median, one.linear_error.high)),
-            f"{1e-3 * np.median(one.fits.modulus):.3g}",
-            f"{1e3 * np.median(one.fits.offset):.2f}",
+            dataset.recording.name,
+            str(len(dataset.recording.presses)),
+            str(int((~dataset.is_training).sum())),
+            *(f"{value:.1%}" for value in (dataset.error.median, dataset.error.high)),
+            *(f"{value:.1%}" for value in (dataset.linear_error.median, dataset.linear_error.high)),
+            f"{1e-3 * np.median(dataset.fits.modulus):.3g}",
+            f"{1e3 * np.median(dataset.fits.offset):.2f}",
         )
     return table
 
 
 def print_result(result: Identification, console: Console) -> None:
-    """Print the errors, the shape with its intervals, the arms, and what the data cannot tell."""
+    """Print the errors, the shape, the arms and the warnings."""
     console.print(error_table(result.sets))
     shape = result.shape
     console.print(f"thickness {1e3 * shape.thickness:.3g} mm, " + _law_text(result), highlight=False)
@@ -223,69 +228,65 @@ def write_curves(result: Identification, path: Path) -> None:
 
     figure = Figure(figsize=(12.0, 4.6 * len(result.sets)), layout="constrained")
     panels = figure.subplots(len(result.sets), 2, squeeze=False)
-    for one, (left, right) in zip(result.sets, panels):
-        _draw_sites(left, one)
-        _draw_all(right, one, result)
+    for dataset, (left, right) in zip(result.sets, panels):
+        _draw_sites(left, dataset)
+        _draw_all(right, dataset, result)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
-def _draw_sites(axes: Any, one: SetResult) -> None:
-    """Some held-out sites, from well to badly described ones."""
-    rows = np.flatnonzero(~one.is_training)
-    order = rows[np.argsort(one.fits.site_errors[rows])]
+def _draw_sites(axes: Any, dataset: SetResult) -> None:
+    """Draw held-out sites at quantiles of their errors."""
+    rows = np.flatnonzero(~dataset.is_training)
+    order = rows[np.argsort(dataset.fits.site_errors[rows])]
     chosen = dict.fromkeys(order[round(share * (len(order) - 1))] for share in SHOWN_QUANTILES)
     for number, row in enumerate(chosen):
-        samples = one.fits.samples
+        samples = dataset.fits.samples
         used = samples.weight[row] > 0.0
         depth, colour = 1e3 * samples.depth[row][used], f"C{number}"
-        label = f"site {samples.sites[row].site}, error {one.fits.site_errors[row]:.1%}"
+        label = f"site {samples.sites[row].site}, error {dataset.fits.site_errors[row]:.1%}"
         axes.plot(depth, samples.force[row][used], "o", color=colour, markersize=4, label=label)
-        axes.plot(depth, one.fits.force[row][used], "-", color=colour)
-        axes.plot(depth, one.linear_fits.force[row][used], ":", color=colour)
+        axes.plot(depth, dataset.fits.force[row][used], "-", color=colour)
+        axes.plot(depth, dataset.linear_fits.force[row][used], ":", color=colour)
     axes.set(xlabel="depth since first contact [mm]", ylabel="force [N]")
     axes.set_title(
-        f"{one.recording.name}: held-out sites, measured (dots), identified (lines), linear (dotted)", size=9
+        f"{dataset.recording.name}: held-out sites, measured (dots), identified (lines), linear (dotted)", size=9
     )
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 
 
-def _draw_all(axes: Any, one: SetResult, result: Identification) -> None:
-    """Force over modulus of all held-out sites on the one curve that they share."""
-    rows = np.flatnonzero(~one.is_training)
-    samples = one.fits.samples
+def _draw_all(axes: Any, dataset: SetResult, result: Identification) -> None:
+    """Draw force over modulus of all held-out sites on their common curve."""
+    rows = np.flatnonzero(~dataset.is_training)
+    samples = dataset.fits.samples
     used = samples.weight[rows] > 0.0
-    depth = (samples.depth[rows] + one.fits.offset[rows, None])[used]
-    area = (samples.force[rows] / one.fits.modulus[rows, None])[used]
+    depth = (samples.depth[rows] + dataset.fits.offset[rows, None])[used]
+    area = (samples.force[rows] / dataset.fits.modulus[rows, None])[used]
     axes.plot(1e3 * depth, 1e6 * area, ".", color="0.6", markersize=3, label="measured, all held-out sites")
     grid = np.linspace(0.0, depth.max(), 200)
     axes.plot(1e3 * grid, 1e6 * result.curve.at(grid), color="C3", label="identified")
     axes.set(xlabel="depth with offset [mm]", ylabel="force / Young's modulus [mm²]")
-    axes.set_title(
-        f"force error {one.error.median:.1%} (median), {one.error.high:.1%} (90th percentile); linear "
-        f"{one.linear_error.median:.1%}, {one.linear_error.high:.1%}",
-        size=9,
-    )
+    axes.set_title(f"force error {_shares(dataset)}", size=9)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 
 
 def write_map(result: Identification, path: Path) -> bool:
-    """Draw the moduli of the sites over x and y; whether any set states the places of its sites."""
+    """Draw the moduli of the sites over x and y; false without a set with places."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    sets = [one for one in result.sets if one.recording.has_places]
+    sets = [dataset for dataset in result.sets if dataset.recording.has_places]
     if not sets:
         return False
     figure = Figure(figsize=(6.4 * len(sets), 5.2), layout="constrained")
-    for one, axes in zip(sets, figure.subplots(1, len(sets), squeeze=False)[0]):
-        place = np.array([site.place for site in one.fits.samples.sites])
-        low, high = np.percentile(one.fits.modulus, [2.0, 98.0])
+    for dataset, axes in zip(sets, figure.subplots(1, len(sets), squeeze=False)[0]):
+        place = np.array([site.place for site in dataset.fits.samples.sites])
+        low, high = np.percentile(dataset.fits.modulus, [2.0, 98.0])
         norm = LogNorm(low, max(high, 1.01 * low))
-        dots = axes.scatter(1e3 * place[:, 0], 1e3 * place[:, 1], c=one.fits.modulus, norm=norm, cmap="magma", s=40)
+        dots = axes.scatter(1e3 * place[:, 0], 1e3 * place[:, 1], c=dataset.fits.modulus, norm=norm, cmap="magma", s=40)
         axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-        axes.set_title(f"{one.recording.name}: Young's modulus of each site", size=9)
+        axes.set_title(f"{dataset.recording.name}: Young's modulus of each site", size=9)
         figure.colorbar(dots, ax=axes, label="Young's modulus [Pa]")
     figure.savefig(path, dpi=110, metadata={"Software": None})
     return True

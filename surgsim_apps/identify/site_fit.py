@@ -1,9 +1,8 @@
-"""What is fitted to each site: its modulus and its contact offset; and the measure of error that every report uses.
+"""Fit of modulus and contact offset to each site, and the error of all reports.
 
-A recording's depth counts from where contact was declared, at a small force: the ball is then an unknown offset deep.
-At a site the force is E A(d + o), with the curve A of `press_model`, the site's modulus E and its offset o, both by
-least squares of the force, as a sensor's noise is the same at every depth. The error is |F_model - F| / F, over the
-deeper two thirds of the press.
+A recording's depth counts from a declared contact at a small force, an unknown offset deep. The force at a site is
+E A(d + o), with the curve A of `press_model`, modulus E and offset o, both by least squares of the force, as a sensor's
+noise is the same at every depth. The error is |F_model - F| / F over the deeper two thirds of the press.
 """
 
 import math
@@ -16,15 +15,15 @@ from numpy.typing import NDArray
 from msdm_core.mesh import FloatArray
 from surgsim_apps.identify.recordings import SitePress
 
-# Errors count where the depth is above this share of the site's largest.
+# Least depth of samples in the error, over the site's largest depth.
 SHALLOW_SHARE = 1.0 / 3.0
-# Offsets that are tried: up to this share of the set's largest depth, in as many steps; then refined.
+# Largest candidate of the offset over the set's largest depth, and number of candidates.
 OFFSET_SHARE, OFFSET_COUNT = 0.5, 46
-# A site is usable with at least as many samples in its deeper two thirds.
+# Fewest samples of a usable site in its deeper two thirds.
 DEEP_COUNT_LEAST = 4
-# A usable site reaches this share of the set's median depth, and its force rises by this factor from a third of it on.
+# Least and largest depth of a usable site over the set's median, and least rise of its force from a third of it on.
 DEPTH_SHARE_LEAST, DEPTH_SHARE_MOST, RISE_LEAST = 0.6, 1.5, 1.2
-# Depths to a curve that is looked up: between them it is straight in (F / E)^(2/3).
+# Depths of a sampled curve, straight in (F / E)^(2/3) between them.
 GRID_COUNT = 181
 
 
@@ -45,15 +44,15 @@ class SampledCurve:
 
 @dataclass(frozen=True, eq=False)
 class SiteSamples:
-    """Loading of the usable sites of a set, in rows as long as the longest; `weight` is 0 where a row has no sample.
+    """Loading of the usable sites of a set, in rows of equal length, padded by samples of weight 0.
 
     Fields:
         sites: the presses
         depth: [m], (n_site, n_sample)
         force: [N], (n_site, n_sample)
         weight: 1 for a sample, else 0, (n_site, n_sample)
-        deep: where errors count, (n_site, n_sample)
-        offsets: that are tried [m], (n_offset,)
+        deep: true for samples in the error, (n_site, n_sample)
+        offsets: candidates [m], (n_offset,)
     """
 
     sites: tuple[SitePress, ...]
@@ -65,12 +64,13 @@ class SiteSamples:
 
     @classmethod
     def of(cls, sites: Sequence[SitePress], offset_largest: float) -> "SiteSamples":
-        """The samples of these sites, with offsets from 0 to the largest [m]."""
+        """Samples of sites, with candidate offsets from 0 to the largest [m]."""
         loading = [(site.depth[site.loading], site.force[site.loading]) for site in sites]
         count = max(len(depth) for depth, _ in loading)
         depth, force, weight = (np.zeros((len(sites), count)) for _ in range(3))
-        for row, (one, newton) in enumerate(loading):
-            depth[row, : len(one)], force[row, : len(one)], weight[row, : len(one)] = one, newton, 1.0
+        for row, (site_depth, site_force) in enumerate(loading):
+            filled = slice(len(site_depth))
+            depth[row, filled], force[row, filled], weight[row, filled] = site_depth, site_force, 1.0
         deep = (weight > 0.0) & (depth > SHALLOW_SHARE * depth.max(axis=1, keepdims=True)) & (force > 0.0)
         return cls(tuple(sites), depth, force, weight, deep, np.linspace(0.0, offset_largest, OFFSET_COUNT))
 
@@ -78,7 +78,7 @@ class SiteSamples:
         return len(self.sites)
 
     def subset(self, rows: NDArray[np.int64]) -> "SiteSamples":
-        """The samples of some of the sites."""
+        """Samples of a part of the sites."""
         return SiteSamples(
             tuple(self.sites[row] for row in rows),
             self.depth[rows], self.force[rows], self.weight[rows], self.deep[rows], self.offsets,
@@ -102,7 +102,7 @@ class SiteFits:
 
     @property
     def site_errors(self) -> FloatArray:
-        """Median of these errors at each site, (n_site,)."""
+        """Median of `deep_errors` at each site, (n_site,)."""
         deep = self.samples.deep
         ordered = np.sort(
             np.where(deep, np.abs(self.force - self.samples.force) / np.where(deep, self.samples.force, 1.0), np.inf),
@@ -115,8 +115,8 @@ class SiteFits:
 def fit_sites(curve: SampledCurve, samples: SiteSamples, *, refine: bool = True) -> SiteFits:
     """Modulus and offset of each site by least squares of the force.
 
-    The modulus is E = sum(A F) / sum(A^2) for a given offset; the offset is the best of those tried, refined by a
-    parabola through its neighbours if `refine`.
+    The modulus is E = sum(A F) / sum(A^2) for a given offset; the offset is the best candidate, refined by a parabola
+    through its neighbours if `refine`.
     """
     offsets = np.broadcast_to(samples.offsets, (len(samples), len(samples.offsets)))
     modulus, square = _best_modulus(curve, samples, offsets)
@@ -151,7 +151,7 @@ def _best_modulus(curve: SampledCurve, samples: SiteSamples, offsets: FloatArray
 
 
 def sort_out(sites: Sequence[SitePress]) -> tuple[list[SitePress], dict[str, list[int]]]:
-    """The usable sites, and the others by the reason why they are left out; judged without any model."""
+    """Usable sites, and numbers of the others by reason; judged without a model."""
     usual = float(np.median([site.depth.max() for site in sites]))
     usable: list[SitePress] = []
     left_out: dict[str, list[int]] = {}
@@ -165,7 +165,7 @@ def sort_out(sites: Sequence[SitePress]) -> tuple[list[SitePress], dict[str, lis
 
 
 def _fault(site: SitePress, usual: float) -> str:
-    """Why a site cannot be used; an empty text if it can."""
+    """Fault of a site; empty for a usable site."""
     if not site.depth.max() <= DEPTH_SHARE_MOST * usual:
         return f"deeper than {DEPTH_SHARE_MOST:.0%} of the set's median"
     depth, force = site.depth[site.loading], site.force[site.loading]
@@ -183,11 +183,11 @@ def _fault(site: SitePress, usual: float) -> str:
 
 
 def depth_largest(sites: Sequence[SitePress]) -> float:
-    """Depth of the deepest press of some sites [m]; 0 for none."""
+    """Depth of the deepest press of sites [m]; 0 for none."""
     return max((float(site.depth.max()) for site in sites), default=0.0)
 
 
 def draw_halves(count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the training half and of the held-out half: a random permutation by the seed, its first half trains."""
+    """Rows of the training half and of the held-out half, by a random permutation."""
     order = np.random.default_rng(seed).permutation(count)
     return np.sort(order[: math.ceil(count / 2)]), np.sort(order[math.ceil(count / 2) :])

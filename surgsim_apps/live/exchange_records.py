@@ -1,4 +1,4 @@
-"""What the processes of physics and page exchange: hands, frames, traces, recorded steps in shared memory; requests."""
+"""Exchange of the processes of physics and page: hands, frames, traces, recordings in shared memory; requests."""
 
 import threading
 import time
@@ -20,20 +20,20 @@ TRACE_STEPS, TRACE_LENGTH = 10, 2048
 # Longest recording, in haptic steps: 5 minutes at 1 kHz.
 RECORDING_MOST = 300_000
 TEXT_MOST = 240
-# How long a reader tries before it raises [s], as the scheduler may stop a writer in the middle of a record; the pause
+# Time of a reader's tries before it raises [s], as the scheduler may stop a writer in the middle of a record; pause
 # between tries [s].
 PATIENCE, PAUSE = 1.0, 50e-6
 _COUNTER_SIZE = 8
 
 
 class LiveError(OSError):
-    """The session cannot start or continue: its physics ended, its memory is inconsistent, its server is unprotected.
+    """End of a session: its physics ended, its memory is inconsistent, or its server is unprotected.
 
-    An `OSError`, which the command line prints as one line.
+    An `OSError`: the command line prints it as one line.
     """
 
 
-# ---- memory that two processes share: one writes without waiting, others read consistent copies --------------------
+# ---- shared memory: one process writes without waiting, others read consistent copies ------------------------------
 
 
 class SharedRecord:
@@ -88,22 +88,22 @@ class SharedRecord:
 
 
 class SharedRows:
-    """An array of zeros shared with a child process that receives it as an argument of its `Process`.
+    """An array of zeros, shared with a child process as an argument of its `Process`.
 
-    The memory has no name that other processes could open, and is freed with the last process that uses it.
+    The memory has no name for other processes, and is freed with the last of its users.
 
     Fields:
         counter: for synchronisation                                              (1,)
-        rows: of the dtype that it was made with                                 (count,)
+        rows: of the constructor's dtype                                         (count,)
     """
 
     def __init__(self, dtype: np.dtype, count: int = 1) -> None:
-        """Allocate `count` rows; the system provides pages of memory when they are first written."""
+        """Allocate `count` rows; the system provides pages of memory at their first write."""
         self._dtype, self._memory = dtype, RawArray("B", _COUNTER_SIZE + count * dtype.itemsize)
         self._view()
 
     def fence(self) -> None:
-        """Memory barrier: readers that use it too see writes before it earlier than writes after it."""
+        """Memory barrier: readers with the same barrier see writes before it earlier than writes after it."""
         # x86 keeps the order of stores; on other processors, acquiring any lock does.
         with self._barrier:
             pass
@@ -143,15 +143,15 @@ def hand_type(arm_count: int) -> np.dtype:
 def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
     """Physics to page, some 60 times a second.
 
-    phase, organ (its number, from 1), recording, the number of recordings begun, whether the breath is held, time [s]
-    since the reset, a message (a fault or a refusal), added_mass [kg]; for each arm its tip [m] and the force of tissue
-    on it [N]; nodes [m]; positions [m] and rotations of geoms.
+    phase, organ (its number, from 1), recording, the number of recordings begun, True for a held breath, time [s] since
+    the reset, a message (a fault or a refusal), added_mass [kg]; for each arm its tip [m] and the force of tissue on it
+    [N]; nodes [m]; positions [m] and rotations of geoms.
     """
     arms = (arm_count, 3)
     return np.dtype(
         [
             ("phase", "i4"), ("organ", "i8"), ("recording", "?"), ("recordings", "i8"),
-            ("breath_held", "?"), ("time", "f8"), ("said", f"S{TEXT_MOST}"), ("added_mass", "f8"),
+            ("breath_held", "?"), ("time", "f8"), ("message", f"S{TEXT_MOST}"), ("added_mass", "f8"),
             ("tip", "f8", arms), ("force", "f8", arms), ("node", "f4", (node_count, 3)),
             ("geom", "f4", (geom_count, 3)), ("turn", "f4", (geom_count, 9)),
         ]
@@ -161,7 +161,7 @@ def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
 def trace_type(arm_count: int) -> np.dtype:
     """Physics to page: a ring of rows of time [s], tip and depth [m], force [N] and its peak since the last row.
 
-    The tip is relative to the organ's ground: where it would be if no motion had moved that.
+    The tip is relative to the moving ground of the organ.
     """
     arms = (arm_count, 3)
     row = np.dtype(
@@ -204,7 +204,7 @@ class RecordedSteps:
 
     @property
     def full(self) -> bool:
-        """Whether the memory is full."""
+        """True if the memory is full."""
         return self.count >= len(self._shared.rows)
 
     @property
@@ -245,7 +245,7 @@ def new_exchange(arm_count: int, node_count: int, geom_count: int) -> Exchange:
     )
 
 
-# ---- requests of the page, sent through a pipe ---------------------------------------------------------------------
+# ---- requests of the page, through a pipe --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A viser server on 127.0.0.1 that answers only requests with the token of this run."""
+"""A viser server on 127.0.0.1, protected by the random token of a run."""
 
 import hmac
 import http
@@ -29,21 +29,21 @@ Answer = Callable[[ServerConnection, Request], Response | None]
 
 
 class GuardedServer:
-    """A viser server that listens on 127.0.0.1 and checks Host, Origin and token of each request.
+    """A viser server on 127.0.0.1 with checks of Host, Origin and token in each request.
 
     The check of Host stops DNS rebinding, the check of Origin stops sockets opened by pages of other sites, and the
     token stops other accounts of the machine. The token is the first part of every path, of the page and of its
     sockets: viser's page opens its socket below its own address. A cookie would also reach every other server on the
     same host, as cookies do not distinguish ports.
 
-    viser has no parameter for the function that websockets calls with each request (`process_request`), so
-    `websockets.asyncio.server.serve`, which viser opens its port with, is replaced while viser starts. If a later viser
-    opens its port in another way, the constructor raises and nothing is served.
+    viser has no parameter for websockets' check of requests (`process_request`), so its function for opening a port,
+    `websockets.asyncio.server.serve`, is replaced while viser starts. If a later viser opens its port in another way,
+    the constructor raises and nothing is served.
 
     Fields:
-        viser: the server whose scene and panel are filled
+        viser: the server with scene and panel
         token: of this run, random
-        address: what to open, token included
+        address: of the page, token included
     """
 
     def __init__(self, port: int, serve_hand: HandServer) -> None:
@@ -54,7 +54,7 @@ class GuardedServer:
             serve_hand: takes over the sockets of `hand.js`.
 
         Raises:
-            LiveError: a version of viser that would answer requests without the checks.
+            LiveError: a version of viser without these checks.
         """
         self.token = secrets.token_urlsafe(32)
         self._serve_hand = serve_hand
@@ -108,7 +108,7 @@ class GuardedServer:
         return answer
 
     def _refusal(self, port: int, request: Request) -> Response | None:
-        """A response that refuses a request to a port with its reason, or None for an accepted one."""
+        """The refusal of a request to a port, with its reason, or None for an accepted one."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or hosts[0] not in [f"{name}:{port}" for name in NAMES]:
             return _refuse(http.HTTPStatus.MISDIRECTED_REQUEST, "this server has another name (Host)")
@@ -121,9 +121,9 @@ class GuardedServer:
 
     def _path_behind_token(self, request: Request) -> str | None:
         """The path of a request without its token and its query, "/" for the page; None without the token."""
-        first, _, rest = request.path.partition("?")[0].removeprefix("/").partition("/")
-        has_token = hmac.compare_digest(first.encode("utf-8", "surrogateescape"), self.token.encode())
-        return f"/{rest}" if has_token else None
+        token, _, path = request.path.partition("?")[0].removeprefix("/").partition("/")
+        has_token = hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self.token.encode())
+        return f"/{path}" if has_token else None
 
 
 def _with_scripts(response: Response) -> Response:
@@ -136,7 +136,7 @@ def _with_scripts(response: Response) -> Response:
 
 
 def _refuse(status: http.HTTPStatus, reason: str) -> Response:
-    """A short response in plain text that closes the connection."""
+    """A short response in plain text; closes the connection."""
     body = f"surgsim: {reason}\n".encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
     headers["Connection"] = "close"

@@ -1,4 +1,4 @@
-"""Packets that `hand.js` sends: keys or a gamepad, and whether a browser draws in software."""
+"""Packets of `hand.js`: keys or a gamepad, and a browser's drawing in software."""
 
 import struct
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ SOFTWARE = b"software"
 
 @dataclass(frozen=True)
 class HandMotion:
-    """Direction of keys or a gamepad: right, away and out, each -1 to 1; the arm it moves; whether its jaw toggles."""
+    """Direction of keys or a gamepad: right, away and out, each -1 to 1; its arm; True to toggle the jaw."""
 
     axes: tuple[float, float, float]
     arm: int

@@ -1,4 +1,4 @@
-"""The organ that the sliders describe: modulus and damping of the tissue, and its lesions."""
+"""The organ of the sliders: modulus and damping of the tissue, and its lesions."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +13,7 @@ SHOWN, HIDDEN, NONE = "as in the scene", "hidden", "none"
 
 @dataclass(frozen=True)
 class OrganChoice:
-    """An organ of a scene as the sliders describe it.
+    """An organ of a scene by the values of the sliders.
 
     Args:
         modulus_factor: on the moduli of healthy tissue and capsule; lesions keep their ratio to it.
@@ -33,13 +33,13 @@ class OrganChoice:
 
 
 def live_scene(scene: Scene) -> Scene:
-    """The scene with mass scaling and the fewest substeps that a little added mass allows (`with_added_mass`).
+    """The scene with mass scaling and the fewest substeps for a little added mass (`with_added_mass`).
 
     Fewer substeps leave time in each haptic step for drawing; mass scaling (`timing.mass_scaling`) also covers the
-    stiffer organs that the sliders describe.
+    stiffer organs of the sliders.
 
     Raises:
-        ValueError: the mesh of the scene cannot be made.
+        ValueError: a scene without a valid mesh.
     """
     choice = OrganChoice(lesions=lesion_kinds(scene)[0])
     return with_added_mass(load_anatomy(scene), lambda anatomy: [chosen_organ(anatomy, choice)]).scene

@@ -1,4 +1,4 @@
-"""The page: shows frames of the physics and passes requests of the panel to the session, thirty times a second."""
+"""The page: frames of the physics for the browser, requests of the panel for the session, thirty times a second."""
 
 import asyncio
 import contextlib
@@ -30,10 +30,10 @@ PICTURE_PERIOD = 1.0 / 30.0
 
 
 class HandSockets:
-    """The sockets that `hand.js` opens, one per tab.
+    """Sockets of `hand.js`, one per tab.
 
     Fields:
-        software: whether a tab without a graphics card was opened
+        software: True once a tab without a graphics card was opened
     """
 
     def __init__(self, session: Session) -> None:
@@ -67,7 +67,7 @@ class Page:
         Args:
             session: a running one.
             port: see `GuardedServer`.
-            out: folder that recordings are written to.
+            out: folder for recordings.
 
         Raises:
             LiveError: see `GuardedServer`.
@@ -84,7 +84,7 @@ class Page:
         # Number of recordings written; the physics counts those begun.
         self._recordings_written = 0
         self._doing: tuple[int, bool] | None = None
-        self._said = ""
+        self._message = ""
         # None: neither a browser nor the user has chosen yet.
         self._plain: bool | None = None
         viser = self.server.viser
@@ -114,7 +114,7 @@ class Page:
         self._arrows = [ForceArrow(scene, arm, size) for arm in range(session.arm_count)]
 
     def _calls(self) -> dict[str, Callable[..., None]]:
-        """Callbacks of the panel; a click toggles the current state, which a button's label may lag behind."""
+        """Callbacks of the panel; a click toggles the current state, even if a button's label lags behind."""
         session = self.session
         return {
             "pause": lambda: session.ask(Pause(session.frame()["phase"] != Phase.PAUSED)),
@@ -162,9 +162,9 @@ class Page:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def end_recording(self) -> str:
-        """Write the current recording to a file; returns a sentence that states the result, or "".
+        """Write the current recording to a file; returns the result in a sentence, or "".
 
-        Call it after `run` has ended, also by an error: the recorded steps lie in shared memory, which outlives the
+        Call it after `run` has ended, also by an error: the recorded steps lie in shared memory and outlive the
         physics' process.
         """
         session = self.session
@@ -206,7 +206,7 @@ class Page:
             self._organ.show_lesions(chosen_lesions(self.session.anatomy, self.session.choice) if on else [])
 
     def _attend(self, frame: np.ndarray) -> None:
-        """Do what does not depend on open tabs: update the stiffness map, apply the sliders, write recordings."""
+        """Work regardless of open tabs: update the stiffness map, apply the sliders, write recordings."""
         session = self.session
         if self._plain is None and self._tabs.software:
             self.show_plain(True)
@@ -223,7 +223,7 @@ class Page:
         recording, begun = bool(frame["recording"]), int(frame["recordings"])
         if begun > self._recordings_written and not recording:
             self._recordings_written = begun
-            self._said = write_recording(session.exchange.recorded.steps.copy(), self._out)
+            self._message = write_recording(session.exchange.recorded.steps.copy(), self._out)
         doing = (int(frame["phase"]), recording)
         if doing != self._doing:
             self._doing = doing
@@ -265,7 +265,7 @@ class Page:
             kept,
             skipped=int(now[0]["skipped"]),
             fps=fps,
-            said=self._said,
+            message=self._message,
             has_breath=self.session.scene.has_breath,
         )
         self._panel.show_status(frame, rows)

@@ -18,7 +18,7 @@ from surgsim_env.scene import Scene
 PLOTTED, PLOT_POINTS = 10.0, 250
 # Smallest upper end of a plot's scale; it doubles as needed.
 PLOT_LEAST = {"N": 0.5, "mm": 4.0}
-# A change applies when the sliders have not moved for this long [s].
+# Time without a motion of the sliders before a change applies [s].
 SETTLED = 0.35
 BUTTON_COLOUR = (52, 84, 96)
 ARM_COLOURS = ("#e8590c", "#1971c2")
@@ -45,7 +45,7 @@ class Panel:
     """The panel beside the picture. viser's threads call the callbacks.
 
     Fields:
-        choice: the organ that the sliders describe
+        choice: the organ of the sliders
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Panel:
             gui: viser's.
             scene: of the session.
             arm_count: 1 or 2.
-            has_jaw: whether the first arm has a jaw.
+            has_jaw: True if the first arm has a jaw.
             calls: callbacks by name: pause() and record(), which toggle;
                 reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), hold_breath(on), plain(on).
         """
@@ -90,7 +90,7 @@ class Panel:
             gui.add_markdown(STEERING.format(second=second, jaw=jaw))
 
     def settled_choice(self) -> OrganChoice | None:
-        """The organ that the sliders describe, once they have stopped moving; None otherwise."""
+        """The organ of the sliders, once they have stopped moving; None otherwise."""
         if self._changed is None or time.monotonic() - self._changed < SETTLED:
             return None
         self._changed = None
@@ -101,7 +101,7 @@ class Panel:
         self._status.content = _status_html(headline(frame), rows)
 
     def show_phase(self, frame: NDArray[Any], recorded: float, *, jaw_closed: bool, breath_held: bool) -> None:
-        """Label the buttons with what a click will do; `recorded` is the length of the recording [s]."""
+        """Label the buttons with the effect of a click; `recorded` is the length of the recording [s]."""
         recording = bool(frame["recording"])
         _set(self._jaw, "value", jaw_closed)
         _set(self._breath, "value", breath_held)
@@ -127,7 +127,7 @@ class Panel:
                 top *= 2.0
             if plot.scales["y"]["max"] != top:
                 plot.scales = _scales(top)
-            plot.data = (since, *(np.ascontiguousarray(one) for one in values.T))
+            plot.data = (since, *(np.ascontiguousarray(curve) for curve in values.T))
 
     def _add_buttons(self) -> None:
         calls = self._calls
@@ -142,15 +142,15 @@ class Panel:
         kinds = lesion_kinds(scene)
         self._lesions = gui.add_dropdown("Lesions", kinds, initial_value=kinds[0])
         ratio = max(
-            (one.modulus_ratio for one in scene.demonstration),
+            (lesion.modulus_ratio for lesion in scene.demonstration),
             default=scene.lesion.modulus_ratio[1] if scene.lesion else 8.0,
         )
         self._ratio = self._slider("Lesions' modulus / tissue's", 1.0, 12.0, 0.5, min(float(ratio), 12.0))
         self._size = self._slider("Lesions' size", 0.5, 1.3, 0.05, 1.0)
         hide = self._button("Hide another lesion", "draw one from the scene's ranges", self._hide)
         hide.visible = HIDDEN in kinds
-        for one in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
-            one.on_update(lambda _: self._choose())
+        for control in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
+            control.on_update(lambda _: self._choose())
         self._checkbox("Show lesions", "show_lesions")
 
     def _choose(self, **changes: Any) -> None:
@@ -180,15 +180,15 @@ class Panel:
         button.on_click(lambda _: clicked())
         return button
 
-    def _checkbox(self, label: str, name: str, *, initial_value: bool = False, **given: Any) -> Any:
-        """A check box that calls the callback of some name with its value."""
-        box = self._gui.add_checkbox(label, initial_value=initial_value, **given)
+    def _checkbox(self, label: str, name: str, *, initial_value: bool = False, **options: Any) -> Any:
+        """A check box for the callback of a name."""
+        box = self._gui.add_checkbox(label, initial_value=initial_value, **options)
         box.on_update(lambda _: self._calls[name](box.value))
         return box
 
 
 def _set(handle: Any, name: str, value: object) -> None:
-    """Set an attribute of an element if it differs: viser sends each one that is set."""
+    """Set an attribute of an element if it differs: viser sends every assignment."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)
 
@@ -255,7 +255,7 @@ def status_rows(
     *,
     skipped: int,
     fps: float,
-    said: str,
+    message: str,
     has_breath: bool = False,
 ) -> list[tuple[str, str]]:
     """Names with values, as HTML.
@@ -265,12 +265,12 @@ def status_rows(
         kept: timing of the steps since the last call.
         skipped: steps skipped since the start.
         fps: pictures sent [1/s].
-        said: message of the page, shown when the physics has none.
-        has_breath: whether the patient has a breath that can be held.
+        message: of the page, shown if the physics has none.
+        has_breath: True if the patient can hold the breath.
     """
-    force = " / ".join(f"{float(np.linalg.norm(one)):.2f}" for one in frame["force"])
+    forces = " / ".join(f"{float(np.linalg.norm(force)):.2f}" for force in frame["force"])
     rows = [
-        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{force} N"),
+        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{forces} N"),
         ("simulated time", f"{float(frame['time']):.1f} s"),
         ("physics", f"{kept.rate:.0f} steps/s"),
         ("real-time factor", f"{kept.real_time:.3f}"),
@@ -283,7 +283,7 @@ def status_rows(
         rows.insert(2, ("breath", "held" if frame["breath_held"] else "goes on"))
     if float(frame["added_mass"]) > 0.0:
         rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
-    words = bytes(frame["said"]).decode("utf-8", "replace") or said
+    words = bytes(frame["message"]).decode("utf-8", "replace") or message
     if words:
         rows.append(("", html.escape(words)))
     return rows

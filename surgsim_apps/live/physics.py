@@ -1,4 +1,4 @@
-"""The physics of a live session: haptic steps in real time that follow the page's hands, requests between them."""
+"""The physics of a live session: haptic steps in real time for the page's hands, requests between them."""
 
 import contextlib
 import gc
@@ -39,20 +39,20 @@ from surgsim_env.scene import Anatomy, Scene, load_anatomy
 
 # Steps between frames for the page, and between checks of the parent process and of requests.
 FRAME_STEPS, LOOK_STEPS = 16, 8
-# Largest speeds at which a tip follows its hand, in general and on the way to the organ [m/s].
+# Largest speeds of a tip after its hand, in general and on the way to the organ [m/s].
 SPEED_LARGEST, APPROACH_SPEED = 0.25, 0.05
 # Initial distance of a tip on slides from the organ, and smallest distance of any contact shape [m].
 HOME_GAP, SHAPE_GAP = 0.015, 0.004
 # Time constant of the smoothing [s]: a mouse reports 20 to 60 positions a second.
 SMOOTHING = 0.030
-# Steps without a beat (of 100 a second) after which the page's process counts as dead.
+# Steps without a beat (of 100 a second) until the page's process counts as dead.
 SILENT_STEPS_MOST = 20
 
 
 def home_of(anatomy: Anatomy, instrument: Instrument) -> FloatArray:
-    """Initial tip positions [m], (3,) or (2, 3): over the middle of the palpable face, or where an arm parks.
+    """Initial tip positions [m], (3,) or (2, 3): over the middle of the palpable face, or an arm's parked position.
 
-    Farther away if an open jaw, which reaches beyond its tip, would touch. `instrument` is parked and is not moved.
+    Farther away if an open jaw would touch beyond its tip. `instrument` is parked and is not moved.
     """
     face = anatomy.face
     if isinstance(instrument, ArmInstrument | Pair):
@@ -81,7 +81,7 @@ def _clearance(anatomy: Anatomy, instrument: Instrument, shift: FloatArray) -> f
 
 
 class BrowserDevice:
-    """A `HapticDevice` whose pose a web page sets; it exerts no force.
+    """A `HapticDevice` with the pose of a web page and without force.
 
     While the page's process is alive every step has a pose, since a hand at rest sends no messages. After 20 steps
     without a beat there is none, and the loop's watchdog fades the force.
@@ -93,7 +93,7 @@ class BrowserDevice:
     dynamics = None
 
     def __init__(self, exchange: Exchange, arm: int, step: float, place: FloatArray) -> None:
-        """Follow one arm's target in steps [s], from where its tip is [m], (3,)."""
+        """Follow one arm's target in steps [s], from its tip's place [m], (3,)."""
         self._hand, self._arm, self._step_time = exchange.hand, arm, step
         self._share = 1.0 - math.exp(-step / SMOOTHING)
         self._beat, self._buttons = -1, 0
@@ -106,7 +106,7 @@ class BrowserDevice:
         self._steps, self._silent = 0, SILENT_STEPS_MOST
 
     def read(self) -> DevicePose | None:
-        """The smoothed pose, None when the page's process is dead."""
+        """The smoothed pose, None if the page's process is dead."""
         self._steps += 1
         record = self._hand.glance()
         if record is None or int(record["beat"]) == self._beat:
@@ -125,7 +125,7 @@ class BrowserDevice:
 
 
 class Physics:
-    """Steps a simulation whose tips follow the page's hands, writes frames, and handles requests between steps."""
+    """A simulation with tips after the page's hands: steps, frames, and requests between steps."""
 
     def __init__(
         self, scene: Scene, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection
@@ -145,7 +145,7 @@ class Physics:
         self._loop = HapticLoop(self._simulation, self._hands, settings)
         self._geoms = np.array(shown_geoms(instrument.model), dtype=np.int64)
         self._pacer = Pacer(pace, exchange.timing.peek)
-        self._phase, self._said = Phase.RUNNING, ""
+        self._phase, self._message = Phase.RUNNING, ""
         # The page counts recordings: one may begin and end between two of its looks.
         self._recording, self._recordings = False, 0
         self._peak = np.zeros(len(self._hands))
@@ -192,7 +192,7 @@ class Physics:
         return True
 
     def _handle(self, request: Request) -> None:
-        self._said = ""
+        self._message = ""
         if isinstance(request, Pause):
             if self._phase in (Phase.RUNNING, Phase.PAUSED):
                 self._phase = Phase.PAUSED if request.on else Phase.RUNNING
@@ -210,7 +210,7 @@ class Physics:
         self._restart()
 
     def _restart(self) -> None:
-        """After the tips were moved: restart the hands from there, and the trace."""
+        """Restart the hands from moved tips, and the trace."""
         self._phase = Phase.RUNNING
         for hand, held in zip(self._hands, self._loop.held, strict=True):
             hand.restart(held.drive.tool.tip_position)
@@ -231,7 +231,7 @@ class Physics:
         except ValueError as error:
             self._organ_number = number
             self._rest(before)
-            self._said = f"this organ cannot be made: {error}"
+            self._message = f"this organ cannot be made: {error}"
 
     def _record(self, on: bool) -> None:
         if on and self._recording:
@@ -241,18 +241,18 @@ class Physics:
             self._recordings += 1
         self._recording = on
 
-    def _record_step(self, told: HapticTelemetry) -> None:
+    def _record_step(self, telemetry: HapticTelemetry) -> None:
         """Add a step to the trace and the recording, and react to faults."""
         exchange, simulation = self._exchange, self._simulation
-        for arm, tip in enumerate(told.tips):
+        for arm, tip in enumerate(telemetry.tips):
             x, y, z = tip.contact_force.tolist()
             self._peak[arm] = max(self._peak[arm], (x * x + y * y + z * z) ** 0.5)
-        step = round(told.time / simulation.haptic_dt)
+        step = round(telemetry.time / simulation.haptic_dt)
         if step % TRACE_STEPS == 0:
             with exchange.trace.writing() as trace:
                 row = trace["row"][int(trace["count"]) % TRACE_LENGTH]
-                row["time"] = told.time
-                for arm, tip in enumerate(told.tips):
+                row["time"] = telemetry.time
+                for arm, tip in enumerate(telemetry.tips):
                     row["tip"][arm] = tip.tip - simulation.ground_shift(tip.tip)
                     row["depth"][arm], row["force"][arm] = tip.depth, tip.contact_force
                 row["peak"] = self._peak
@@ -260,30 +260,30 @@ class Physics:
             self._peak[:] = 0.0
         if self._recording:
             if exchange.recorded.full:
-                self._recording, self._said = False, "the recording is full"
+                self._recording, self._message = False, "the recording is full"
             else:
                 poses = [hand.pose for hand in self._hands]
                 places = np.array([np.full(3, np.nan) if pose is None else pose.position for pose in poses])
-                tips = np.array([tip.tip for tip in told.tips])
+                tips = np.array([tip.tip for tip in telemetry.tips])
                 buttons = [0 if pose is None else pose.buttons for pose in poses]
                 exchange.recorded.append(
-                    told.time, places, buttons, tips, np.array([tip.contact_force for tip in told.tips])
+                    telemetry.time, places, buttons, tips, np.array([tip.contact_force for tip in telemetry.tips])
                 )
-        if told.fault:
-            self._phase, self._said, self._recording = Phase.FAULT, told.fault, False
+        if telemetry.fault:
+            self._phase, self._message, self._recording = Phase.FAULT, telemetry.fault, False
             self._write_frame()
 
     def _write_frame(self) -> None:
         """Write a frame for the page."""
-        simulation, told = self._simulation, self._last
+        simulation, telemetry = self._simulation, self._last
         data = simulation.instrument.data
         with self._exchange.frame.writing() as frame:
             frame["phase"], frame["organ"] = int(self._phase), self._organ_number
             frame["recording"], frame["recordings"] = self._recording, self._recordings
             frame["breath_held"] = simulation.holds_breath
-            frame["time"], frame["said"] = simulation.time, self._said.encode()
+            frame["time"], frame["message"] = simulation.time, self._message.encode()
             frame["added_mass"] = self._organ.added_mass
-            for arm, tip in enumerate(told.tips):
+            for arm, tip in enumerate(telemetry.tips):
                 frame["tip"][arm] = self._loop.held[arm].drive.tool.tip_position
                 frame["force"][arm] = tip.contact_force
             frame["node"] = simulation.organ_state.node_position[:, :3]
@@ -299,7 +299,7 @@ def run_physics(
 ) -> None:
     """Run the child process; it ends on request, or when the process with the id `parent` has ended.
 
-    An error at the start is sent through `requests` as a text, and the process ends with status 1.
+    An error at the start goes through `requests` as a text, and the process ends with status 1.
     """
     # The page's process handles Ctrl-C and ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -318,7 +318,7 @@ def run_physics(
 
 
 def _raise_priority() -> None:
-    """Raise the process' priority above pictures and browsers, where that is allowed.
+    """Raise the process' priority above pictures and browsers, if allowed.
 
     Linux shares the processor first between sessions (autogroups), then within each by niceness, so the physics gets
     a session of its own.

@@ -20,9 +20,9 @@ def columns(arm_count: int) -> list[str]:
 
 
 def write_recording(steps: NDArray[Any], folder: Path) -> str:
-    """Write steps to the next free recording-NUMBER.csv of a folder; returns a sentence that states the result.
+    """Write steps to the next free recording-NUMBER.csv of a folder; returns the result in a sentence.
 
-    In steps in which a hand gave no place its position is nan.
+    The position of a hand is nan in steps without its place.
     """
     if not np.isfinite(steps["hand"]).any():
         return "nothing was recorded: no hand moved an instrument"

@@ -1,4 +1,4 @@
-"""A live session, seen from the page's process: moves the hands, sends requests, reads the physics' frames."""
+"""A live session in the page's process: motions of the hands, requests to the physics, its frames."""
 
 import contextlib
 import multiprocessing
@@ -31,11 +31,11 @@ from surgsim_env.coupling import Simulation
 from surgsim_env.rendering import shown_geoms
 from surgsim_env.scene import Scene, load_anatomy
 
-# Updates of the hands [1/s], and how long a key or stick counts as held after its last message [s].
+# Updates of the hands [1/s], and the duration of a key or stick after its last message [s].
 BEAT_RATE, HELD = 100.0, 0.15
 # Speed of a target at full deflection [m/s].
 HAND_SPEED = 0.04
-# The button that closes a jaw, as `HapticSettings.jaw_button` has it, and the first arm's that holds the breath.
+# Buttons for closing a jaw (JAW_BIT of `HapticSettings`), and for holding the breath, of the first arm.
 JAW_BUTTON, BREATH_BUTTON = 1, 1 << BREATH_BIT
 # Longest start, with an empty numba cache [s].
 START_TIMEOUT = 300.0
@@ -60,10 +60,10 @@ class Session:
         Args:
             scene: the scene that is shown.
             pace: of the haptic steps; one a haptic step of the scene by default.
-            clock: measures how long keys and sticks are held [s].
+            clock: for the durations of keys and sticks [s].
 
         Raises:
-            ValueError: a scene whose mesh or instrument cannot be made.
+            ValueError: a scene without a valid mesh or instrument.
         """
         self.scene = live_scene(scene)
         self.anatomy = load_anatomy(self.scene)
@@ -106,14 +106,14 @@ class Session:
 
     @property
     def alive(self) -> bool:
-        """Whether the physics' process is running."""
+        """True if the physics' process is running."""
         return self._process.is_alive()
 
     def wait(self, timeout: float = START_TIMEOUT) -> None:
         """Wait until the physics steps.
 
         Raises:
-            LiveError: the process ended (with its reason, where it sent one) or did not start in time.
+            LiveError: the process ended (with its reason, if it sent one) or did not start in time.
         """
         deadline = time.monotonic() + timeout
         while self.frame()["phase"] == Phase.STARTING or not int(self.exchange.timing.peek["steps"]):
@@ -123,19 +123,19 @@ class Session:
             time.sleep(0.02)
 
     def require_alive(self) -> None:
-        """Check that the physics' process is running.
+        """Check the physics' process.
 
         Raises:
-            LiveError: it ended; with its reason, where it sent one.
+            LiveError: it ended; with its reason, if it sent one.
         """
         if self.alive:
             return
-        said = ""
+        reason = ""
         # Other errors were printed by Python.
         with contextlib.suppress(EOFError, OSError):
-            said = self._pipe.recv() if self._pipe.poll() else ""
-        why = said or f"exit code {self._process.exitcode}; its own message, if any, stands above"
-        raise LiveError(f"the physics' process died: {why}")
+            reason = self._pipe.recv() if self._pipe.poll() else ""
+        reason = reason or f"exit code {self._process.exitcode}; its own message, if any, stands above"
+        raise LiveError(f"the physics' process died: {reason}")
 
     def frame(self) -> NDArray[Any]:
         """The newest frame, a copy."""
@@ -158,7 +158,7 @@ class Session:
         with self._lock:
             if isinstance(request, Change):
                 self.choice = request.choice
-            # Where the physics is gone, `alive` says so.
+            # Without the physics, `alive` is False.
             with contextlib.suppress(OSError):
                 self._pipe.send(request)
 
@@ -189,7 +189,7 @@ class Session:
 
     @property
     def jaw_closed(self) -> bool:
-        """Whether the first arm's jaw is commanded to close."""
+        """True if the first arm's jaw is commanded to close."""
         return bool(self._buttons[0] & JAW_BUTTON)
 
     def hold_breath(self, held: bool) -> None:
@@ -198,7 +198,7 @@ class Session:
 
     @property
     def breath_held(self) -> bool:
-        """Whether the page holds the breath."""
+        """True if the page holds the breath."""
         return bool(self._buttons[0] & BREATH_BUTTON)
 
     def close(self) -> None:
@@ -215,7 +215,7 @@ class Session:
         self._pipe.close()
 
     def _beat(self) -> None:
-        """Move the hands that are pushed, and signal to the physics that this process is alive."""
+        """Move the pushed hands, and signal life to the physics."""
         period, then = 1.0 / BEAT_RATE, self._clock()
         while not self._ended.wait(period):
             now = self._clock()

@@ -1,4 +1,4 @@
-"""What the page draws: camera, light, ground, organ and stiffness map, instrument, handles, force arrows."""
+"""Contents of the page's picture: camera, light, ground, organ and stiffness map, instrument, handles, force arrows."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ FORCE_SHARE, FORCE_LENGTH, FORCE_LEAST = 0.4, 0.06, 0.005
 DEPTH_SHARE = 0.35
 # Standard deviation of a touch's Gaussian weight, in contact radii sqrt(R d), and its cut-off in deviations.
 WIDTH, REACH = 0.55, 2.0
-# Least sum of weights at which a node counts as felt.
+# Least sum of weights of a felt node.
 WEIGHT_LEAST = 0.5
 ORGAN_COLOUR, LESION_COLOUR = (158, 58, 50), (250, 214, 120)
 # Contrast of the first and the last colour, relative to the lower quartile of the map; colours from soft to stiff.
@@ -95,7 +95,7 @@ class Surroundings:
         self.show_plain(False)
 
     def show_plain(self, on: bool) -> None:
-        """Turn off what costs a software renderer most: shadows, reflections, a glossy ground."""
+        """Turn the greatest costs of a software renderer off or on: shadows, reflections, a glossy ground."""
         self._scene.configure_default_lights(enabled=True, cast_shadow=not on)
         self._scene.configure_environment_map(None if on else "warehouse", environment_intensity=0.6)
         self._scene.add_light_ambient("/ambient", intensity=AMBIENT if on else 0.0)
@@ -111,7 +111,7 @@ class FeltMap:
     Fields:
         nodes: indices of the surface nodes                                      (n_surface,)
         contrast: the ratio; 0 without touches                                   (n_surface,)
-        felt: whether the weights of the touches suffice                         (n_surface,)
+        felt: mask of nodes with enough weight of touches                        (n_surface,)
         version: increases with each change
     """
 
@@ -154,7 +154,7 @@ class FeltMap:
 
     @property
     def felt(self) -> np.ndarray:
-        """Whether a node counts as felt, (n_surface,)."""
+        """Mask of felt nodes, (n_surface,)."""
         return self._weight >= WEIGHT_LEAST
 
     @property
@@ -167,7 +167,7 @@ class OrganView:
     """Nodes of a viser scene for an organ, its paint, and its lesions.
 
     Fields:
-        paints: whether the stiffness map is shown
+        paints: True while the stiffness map is shown
     """
 
     def __init__(self, scene: Any, anatomy: Anatomy) -> None:
@@ -269,7 +269,7 @@ class _Paint:
 
 
 def colour_levels(contrast: FloatArray) -> np.ndarray:
-    """Index into COLOURS of each contrast, relative to the lower quartile of all; -1 where it is NaN."""
+    """Index into COLOURS of each contrast, relative to the lower quartile of all; -1 for NaN."""
     level = np.full(len(contrast), -1)
     known = np.isfinite(contrast)
     if known.any():
@@ -293,7 +293,7 @@ class InstrumentView:
         Args:
             scene: viser's.
             model: the instrument's.
-            geoms: which of its geoms are drawn.
+            geoms: those to be drawn.
             arm_count: 1, or 2: then the names of the second arm's bodies begin with "right_".
         """
         self.nodes, self.arms = [], []
@@ -315,7 +315,7 @@ class InstrumentView:
             node.position, node.wxyz = place * SCALE, quaternion.copy()
 
     def _moved(self, position: NDArray[np.float32], rotation: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which geoms have moved since they were last sent, (n_geom,)."""
+        """Mask of geoms with a motion since they were last sent, (n_geom,)."""
         now = np.concatenate([position, rotation], axis=1)
         moved = np.ones(len(now), dtype=bool) if self._shown is None else np.abs(now - self._shown).max(axis=1) > STILL
         self._shown = now if self._shown is None else np.where(moved[:, None], now, self._shown)
@@ -350,9 +350,9 @@ def _add(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> Any:
             name, radius=float(size[0]), height=float(2.0 * size[1]), color=colour, radial_segments=24
         )
     if kind == "CAPSULE":
-        made = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[20, 20])
-        made.apply_translation(-made.bounds.mean(axis=0))
-        vertices, faces = made.vertices, made.faces
+        capsule = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[20, 20])
+        capsule.apply_translation(-capsule.bounds.mean(axis=0))
+        vertices, faces = capsule.vertices, capsule.faces
     else:
         mesh = int(model.geom_dataid[geom])
         vertices, faces = mesh_rows(model, mesh, "vert") * SCALE, mesh_rows(model, mesh, "face")
@@ -367,7 +367,7 @@ def add_handle(
     directions: FloatArray,
     pulled: Callable[[int, str, FloatArray], None],
 ) -> Any:
-    """Add the arrows that drag a hand out of the organ, into it, and across it.
+    """Add arrows for dragging a hand out of the organ, into it, and across it.
 
     Args:
         scene: viser's.
@@ -403,7 +403,7 @@ def add_handle(
 
 
 class ForceArrow:
-    """The tissue's force on a tip, as an arrow. A plain mesh, whose shader the browser has compiled already."""
+    """The tissue's force on a tip, as an arrow; a plain mesh, since its shader is compiled already."""
 
     def __init__(self, scene: Any, arm: int, size: float) -> None:
         """Add it, with zero length, to a scene with an organ of `size` [m]."""

@@ -1,4 +1,4 @@
-"""Contrast maps: stiffness over a healthy baseline at each site, the lesions felt on a map, and their errors."""
+"""Contrast maps: stiffness over a healthy baseline at each site, estimated lesions and their errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from msdm_core.mesh import FloatArray, SurfaceDistance
 from surgsim_apps.palpate.truth import Truth
 from surgsim_env.palpation import strongest_apart
 
-# Rounds of reweighting: first Huber's weights, whose problem is convex, then Tukey's, which reject lesions.
+# Rounds of reweighting: Huber's weights first, for a convex problem, then Tukey's, which reject lesions.
 HUBER_ROUNDS = 8
 ROUNDS = 30
 HUBER_LIMIT = 1.345  # 95 % efficient for normal residuals (Holland & Welsch 1977)
 TUKEY_LIMIT = 4.685
-# A baseline needs this many sites for each of its coefficients; with fewer it is a plane, then the median.
+# Least sites per coefficient of a baseline; with fewer it is a plane, then the median.
 SITES_PER_COEFFICIENT = 3
 # Ridge penalty of each coefficient, as a share of its regressor's spread.
 RIDGE = 0.03
-# Least scale of the residuals [log stiffness]: those of a map without noise have none.
+# Least scale of the residuals [log stiffness]: without noise they vanish.
 SMALLEST_SCALE = 1e-3
 
-# A maximum is felt where the smoothed contrast exceeds its surroundings by the floor, and by this many times the
+# A maximum is felt if the smoothed contrast exceeds its surroundings by the floor, and by this many times the
 # scatter from site to site. The floor was set by trial on 15 lesions in the shipped and a CT liver, none of
-# them one that a test presses; no model map without a lesion came near it.
+# them pressed by a test; no model map without a lesion came near it.
 SCATTERS_ABOVE = 5.0
 CONTRAST_FLOOR = 0.17
 # Its surroundings: the lower quartile between these distances, in site spacings; lesions only raise contrast.
@@ -53,7 +53,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class LesionScore:
-    """One lesion's best match on a map: index of the estimate or None, its error along the surface [m], felt or not."""
+    """Match of a lesion on a map: index of the estimate or None, error along the surface [m], largest contrast."""
 
     truth: Truth
     estimate: int | None
@@ -62,7 +62,7 @@ class LesionScore:
 
     @property
     def felt(self) -> bool:
-        """Whether the estimate lies within the lesion's radius."""
+        """True if the estimate lies within the lesion's radius."""
         return self.error <= self.truth.radius
 
 
@@ -75,10 +75,10 @@ class ContrastMap:
         contrast: stiffness / baseline at each site                                                 (n_site,)
         estimates: lesions, strongest first
         scores: one for each lesion
-        false_alarms: estimates that lie within no lesion's radius
+        false_alarms: estimates outside every lesion's radius
         healthy_count: sites far from every lesion
         healthy_std: of the contrast over them
-        threshold: a maximum is felt where the smoothed contrast exceeds its surroundings by more
+        threshold: least excess of a felt maximum over its surroundings, of the smoothed contrast
     """
 
     name: str
@@ -92,7 +92,7 @@ class ContrastMap:
 
     @property
     def felt_count(self) -> int:
-        """How many lesions were felt within their radius."""
+        """Number of lesions felt within their radius."""
         return sum(score.felt for score in self.scores)
 
 
@@ -117,7 +117,7 @@ def robust_spread(values: FloatArray) -> float:
 def contrast_with_neighbours(
     stiffness: FloatArray, plane: FloatArray, geometry: FloatArray | None = None
 ) -> FloatArray:
-    """Stiffness over a baseline that follows the healthy majority of the sites, shape (n_site,).
+    """Stiffness over a baseline through the healthy majority of the sites, shape (n_site,).
 
     The baseline is a robust regression of log stiffness on a quadratic in the projection plane and on further
     geometric regressors; lesions are its outliers.
@@ -135,7 +135,7 @@ def contrast_with_neighbours(
 def contrast_with_model(stiffness: FloatArray, model_stiffness: FloatArray) -> FloatArray:
     """Stiffness over a pre-operative model's at the same sites, over that ratio's healthy majority, shape (n_site,).
 
-    Dividing by the majority cancels the patient's modulus, which the model does not know.
+    Dividing by the majority cancels the patient's modulus, unknown to the model.
     """
     ratio = stiffness / model_stiffness
     return ratio / healthy_majority(ratio)[0]
@@ -181,7 +181,7 @@ def _robust_fit(columns: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> list[Estimate]:
-    """Local maxima of the smoothed contrast that stand out from the healthy majority, strongest first.
+    """Local maxima of the smoothed contrast above their surroundings, strongest first.
 
     The contrast is smoothed by a Gaussian; maxima near a stronger one are dropped; each is placed at the centroid of
     the excess contrast around it.
@@ -197,7 +197,7 @@ def feel_lesions(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> 
     threshold = felt_threshold(sites, contrast, spacing=spacing)
     near = distance <= CENTROID_SPACINGS
     maxima = np.flatnonzero(smooth >= np.where(near, smooth, -np.inf).max(axis=1))
-    excess = np.array([smooth[one] - _surroundings(smooth, distance[one], middle) for one in maxima])
+    excess = np.array([smooth[peak] - _surroundings(smooth, distance[peak], middle) for peak in maxima])
     maxima, excess = maxima[excess > threshold], excess[excess > threshold]
     chosen, _ = strongest_apart(smooth[maxima], sites[maxima], APART_SPACINGS * spacing)
     estimates = []
@@ -218,12 +218,12 @@ def smoothed(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> Floa
 
 
 def felt_threshold(sites: FloatArray, contrast: FloatArray, *, spacing: float) -> float:
-    """How far a maximum of the smoothed contrast must exceed its surroundings; arguments as in `feel_lesions`."""
+    """Least excess of a felt maximum over its surroundings; arguments as in `feel_lesions`."""
     return max(CONTRAST_FLOOR, SCATTERS_ABOVE * robust_spread(contrast - smoothed(sites, contrast, spacing=spacing)))
 
 
 def _surroundings(smooth: FloatArray, distance: FloatArray, majority: float) -> float:
-    """The healthy level around a site; that of the whole map where the raster ends too soon."""
+    """Healthy level around a site; that of the whole map near the end of the raster."""
     low, high = SURROUNDINGS_SPACINGS
     ring = (distance > low) & (distance <= high)
     return float(np.quantile(smooth[ring], 0.25)) if ring.sum() >= FEWEST_SURROUNDING else majority

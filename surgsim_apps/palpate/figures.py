@@ -9,7 +9,7 @@ import numpy as np
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.palpate.contrast_map import ContrastMap
-from surgsim_apps.palpate.job import MODEL, PalpationResult
+from surgsim_apps.palpate.palpation import PalpationResult
 from surgsim_apps.palpate.truth import Truth
 from surgsim_apps.reports.surface_drawing import (
     FADE_TO,
@@ -36,9 +36,9 @@ LIVER = np.array([0.56, 0.20, 0.16])
 STEEL = np.array([0.80, 0.83, 0.88])
 NIGHT = "#0e1117"
 COLOUR_MAP = "magma"
-# A glow that may extend beyond the last sites ends this many site spacings from them.
-RUN_OUT = 2.6
-# Least upper end of the colour scale, so that a map without a lesion looks flat.
+# Reach of the glow beyond the last sites, in site spacings.
+GLOW_REACH = 2.6
+# Least upper end of the colour scale: a map without a lesion looks flat.
 SMALLEST_TOP = 1.35
 
 
@@ -57,8 +57,8 @@ def write_stiffness_map(palpation: PalpationResult, path: Path) -> None:
     )
     view = OrthographicView.along(palpation.anatomy.face.approach)
     patches = organ_patches(palpation.anatomy)
-    for axes, one in zip((left, middle), palpation.maps, strict=True):
-        _draw_map(figure, axes, palpation, one, patches, view)
+    for axes, contrast_map in zip((left, middle), palpation.maps, strict=True):
+        _draw_map(figure, axes, palpation, contrast_map, patches, view)
     _draw_curves(right, palpation)
     save_png(figure, path)
 
@@ -71,8 +71,8 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     scene = palpation.anatomy.scene
-    one = next(item for item in palpation.maps if item.name == MODEL)
-    place = one.estimates[0].point if one.estimates else palpation.sites[0]
+    model_map = palpation.model_map
+    place = model_map.estimates[0].point if model_map.estimates else palpation.sites[0]
     site, normal = palpation.anatomy.face.project(place)
     approach = palpation.anatomy.face.approach
     right, up = tangent_axes(approach)
@@ -80,9 +80,9 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
     view = OrthographicView.along(approach + 0.45 * up + 0.35 * right, up=-approach + 0.8 * up)
     organ = organ_patches(palpation.anatomy)
     colours = np.broadcast_to(LIVER, (len(organ.corners), 3)).copy()
-    glow, weight = _map_over(palpation, one, organ, everywhere=True)
+    glow, weight = _map_over(palpation, model_map, organ, everywhere=True)
     painted = np.flatnonzero(weight > 0.0)
-    strength = np.clip((glow[painted] - 1.0) / (max(SMALLEST_TOP, one.contrast.max()) - 1.0), 0.0, 1.0)
+    strength = np.clip((glow[painted] - 1.0) / (max(SMALLEST_TOP, model_map.contrast.max()) - 1.0), 0.0, 1.0)
     heat = _colours("inferno", 0.42 + 0.55 * strength)
     share = (weight[painted] * np.clip(strength * 2.2, 0.0, 0.95))[:, None]
     colours[painted] = (1.0 - share) * colours[painted] + share * heat
@@ -102,39 +102,51 @@ def write_organ_picture(palpation: PalpationResult, path: Path) -> None:
 
 
 def _draw_map(
-    figure: Figure, axes: Axes, palpation: PalpationResult, one: ContrastMap, patches: Patches, view: OrthographicView
+    figure: Figure,
+    axes: Axes,
+    palpation: PalpationResult,
+    contrast_map: ContrastMap,
+    patches: Patches,
+    view: OrthographicView,
 ) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    norm = Normalize(min(0.85, float(one.contrast.min())), max(SMALLEST_TOP, float(one.contrast.max())))
-    field, weight = _map_over(palpation, one, patches)
+    norm = Normalize(
+        min(0.85, float(contrast_map.contrast.min())), max(SMALLEST_TOP, float(contrast_map.contrast.max()))
+    )
+    field, weight = _map_over(palpation, contrast_map, patches)
     tint = _colours(COLOUR_MAP, norm(field))
     colours = (1.0 - weight[:, None]) * TISSUE + weight[:, None] * tint
     draw_patches(axes, [(patches, colours, 0.10)], view)
     _mark_sites(axes, palpation, view, colour="white", alpha=0.55)
-    for score in one.scores:
+    for score in contrast_map.scores:
         _outline(axes, score.truth, view)
-    _mark_estimates(axes, one, view)
+    _mark_estimates(axes, contrast_map, view)
     figure.colorbar(
-        ScalarMappable(norm, COLOUR_MAP), ax=axes, shrink=0.75, pad=0.02, label=f"stiffness / that of the {one.name}"
+        ScalarMappable(norm, COLOUR_MAP),
+        ax=axes,
+        shrink=0.75,
+        pad=0.02,
+        label=f"stiffness / that of the {contrast_map.name}",
     )
-    axes.set_title(f"against the {one.name}\n{_result(one)}", color=INK, fontsize=11)
+    axes.set_title(f"against the {contrast_map.name}\n{_result(contrast_map)}", color=INK, fontsize=11)
     axes.set_aspect("equal")
     axes.set_axis_off()
 
 
-def _result(one: ContrastMap) -> str:
-    errors = ", ".join(f"{score.error * 1e3:.0f} mm" for score in one.scores if score.felt)
-    found = f"felt {one.felt_count} of {len(one.scores)}" + (f", off by {errors}" if errors else "")
-    alarms = f"; {one.false_alarms} false" if one.false_alarms else ""
-    return f"{found if one.scores else 'no lesion hidden'}{alarms}; healthy sites 1 ± {one.healthy_std:.2f}"
+def _result(contrast_map: ContrastMap) -> str:
+    errors = ", ".join(f"{score.error * 1e3:.0f} mm" for score in contrast_map.scores if score.felt)
+    text = f"felt {contrast_map.felt_count} of {len(contrast_map.scores)}" + (f", off by {errors}" if errors else "")
+    alarms = f"; {contrast_map.false_alarms} false" if contrast_map.false_alarms else ""
+    healthy = f"healthy sites 1 ± {contrast_map.healthy_std:.2f}"
+    return f"{text if contrast_map.scores else 'no lesion hidden'}{alarms}; {healthy}"
 
 
 def _map_over(
-    palpation: PalpationResult, one: ContrastMap, patches: Patches, everywhere: bool = False
+    palpation: PalpationResult, contrast_map: ContrastMap, patches: Patches, everywhere: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """The map's value on each patch and its weight: 0 off the palpable face unless `everywhere`."""
+    """Value of a map on each patch and its weight, 0 off the palpable face unless `everywhere`."""
     anatomy = palpation.anatomy
     palpable = set(map(frozenset, anatomy.face.triangles.tolist()))
     chosen = np.array([frozenset(row) in palpable for row in anatomy.mesh.boundary_triangles.tolist()])
@@ -142,8 +154,10 @@ def _map_over(
     centres = patches.corners[on_face].mean(axis=1)
     sites = palpation.sites[palpation.used]
     field, weight = np.ones(len(on_face)), np.zeros(len(on_face))
-    field[on_face] = interpolated(sites, one.contrast, centres)
-    weight[on_face] = nearness(sites, centres, anatomy.scene.palpation.site_spacing, RUN_OUT if everywhere else FADE_TO)
+    field[on_face] = interpolated(sites, contrast_map.contrast, centres)
+    weight[on_face] = nearness(
+        sites, centres, anatomy.scene.palpation.site_spacing, GLOW_REACH if everywhere else FADE_TO
+    )
     return field, weight
 
 
@@ -156,7 +170,7 @@ def _mark_sites(axes: Axes, palpation: PalpationResult, view: OrthographicView, 
 
 
 def _outline(axes: Axes, truth: Truth, view: OrthographicView) -> None:
-    """Draw the lesion's circle on the surface above it: an estimate inside it is within its radius."""
+    """Draw a lesion's circle on the surface above it, around the estimates within its radius."""
     first, second = tangent_axes(truth.normal)
     angle = np.linspace(0.0, 2.0 * np.pi, 90)[:, None]
     circle = view.flat(truth.point + truth.radius * (np.cos(angle) * first + np.sin(angle) * second))
@@ -164,12 +178,12 @@ def _outline(axes: Axes, truth: Truth, view: OrthographicView) -> None:
         axes.plot(*circle.T, color=colour, lw=width, ls=(0, (4, 2.5)), zorder=3)
 
 
-def _mark_estimates(axes: Axes, one: ContrastMap, view: OrthographicView) -> None:
+def _mark_estimates(axes: Axes, contrast_map: ContrastMap, view: OrthographicView) -> None:
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=3.0, foreground=INK)]
-    errors = {score.estimate: score.error for score in one.scores if score.felt}
-    for index, estimate in enumerate(one.estimates):
+    errors = {score.estimate: score.error for score in contrast_map.scores if score.felt}
+    for index, estimate in enumerate(contrast_map.estimates):
         x, y = view.flat(estimate.point)
         colour = "#9cf6ff" if index in errors else "#ffb3a7"
         text = f"{errors[index] * 1e3:.1f} mm" if index in errors else "false"
@@ -181,10 +195,9 @@ def _mark_estimates(axes: Axes, one: ContrastMap, view: OrthographicView) -> Non
 
 
 def _draw_curves(axes: Axes, palpation: PalpationResult) -> None:
-    """Force over depth where the contrast with the model is largest and where it is closest to 1."""
-    one = next(item for item in palpation.maps if item.name == MODEL)
+    """Draw force over depth at the sites of `_typical_sites`."""
     numbers = np.flatnonzero(palpation.used)
-    stiff, usual = _typical_sites(palpation, one)
+    stiff, usual = _typical_sites(palpation)
     for index, colour, name in ((stiff, "#c8452f", "over a lesion"), (usual, "#3b6ea8", "over healthy tissue")):
         if index is None:
             continue
@@ -202,15 +215,15 @@ def _draw_curves(axes: Axes, palpation: PalpationResult) -> None:
     axes.legend(frameon=False, fontsize=9, loc="upper left")
 
 
-def _typical_sites(palpation: PalpationResult, one: ContrastMap) -> tuple[int | None, int | None]:
-    """Indices into the used sites: the largest contrast above a lesion, and the healthy site closest to 1."""
-    sites = palpation.sites[palpation.used]
+def _typical_sites(palpation: PalpationResult) -> tuple[int | None, int | None]:
+    """Indices of the used sites with the largest contrast above a lesion and with the healthy one closest to 1."""
+    contrast, sites = palpation.model_map.contrast, palpation.sites[palpation.used]
     distance = np.full(len(sites), np.inf)
     for truth in palpation.truths:
         distance = np.minimum(distance, np.linalg.norm(sites - truth.point, axis=1) / truth.radius)
     over, off = np.flatnonzero(distance <= 1.0), np.flatnonzero(distance > 2.0)
-    stiff = int(over[np.argmax(one.contrast[over])]) if len(over) else None
-    usual = int(off[np.argmin(np.abs(one.contrast[off] - 1.0))]) if len(off) else None
+    stiff = int(over[np.argmax(contrast[over])]) if len(over) else None
+    usual = int(off[np.argmin(np.abs(contrast[off] - 1.0))]) if len(off) else None
     return stiff, usual
 
 

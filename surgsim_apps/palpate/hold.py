@@ -1,4 +1,4 @@
-"""How well an organ is held: forces of healthy presses beside Hertz's, and how far the rest of the organ gives way."""
+"""Hold of an organ: forces of healthy presses beside Hertz's, and travel of its far side."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from surgsim_env.scene import Anatomy, hertz_force
 
 # An organ sways where a node of its farther half moves by more than this share of the tip's depth.
 FAR_SHARE_LARGEST = 0.15
-# A press that feels less than this share of Hertz's force moves the organ more than it dents it. Held organs of a CT
-# felt 0.72 to 0.98 of it, those that swayed 0.15 to 0.75.
+# Below this share of Hertz's force a press moves the organ more than it dents it. Held organs of a CT
+# felt 0.72 to 0.98 of it, swaying ones 0.15 to 0.75.
 FORCE_SHARE_LEAST = 0.6
 # Healthy sites that `check_hold` presses.
 SITES = 5
@@ -27,7 +27,7 @@ class Hold:
     """Healthy presses on an organ.
 
     Fields:
-        sites: where it was pressed [m]                                                             (n, 3)
+        sites: of the presses [m]                                                                   (n, 3)
         force: held at the end of each press [N]                                                    (n,)
         expected: of a half space of the same tissue at the same depth (Hertz 1881) [N]             (n,)
         far_share: largest travel of a node in the farther half of the organ over the tip's depth   (n,)
@@ -45,21 +45,21 @@ class Hold:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What is wrong with the organ's support, in sentences; empty for one that is held well."""
-        found = []
+        """Faults of the organ's support in sentences; empty for a well-held organ."""
+        faults = []
         worst = int(np.argmax(self.far_share))
         if self.far_share[worst] > FAR_SHARE_LARGEST:
-            found.append(
-                f"the organ sways: pressed at {_place(self.sites[worst])} mm, its far side moves by "
+            faults.append(
+                f"the organ sways: pressed at {place_text(self.sites[worst])} mm, its far side moves by "
                 f"{self.far_share[worst]:.1%} of the tip's depth; the rule is at most {FAR_SHARE_LARGEST:.0%}"
             )
         share = float(np.median(self.force_share))
         if share < FORCE_SHARE_LEAST:
-            found.append(
+            faults.append(
                 f"presses move the organ in place of denting it: they feel {share:.2f} of Hertz's force (median), the "
                 f"rule is at least {FORCE_SHARE_LEAST:g}"
             )
-        return tuple(f"{one}; lesions may be missed: {WAYS}" for one in found)
+        return tuple(f"{fault}; lesions may be missed: {WAYS}" for fault in faults)
 
     @property
     def text(self) -> str:
@@ -73,23 +73,24 @@ class Hold:
 
 
 def hold_of(anatomy: Anatomy, presses: Sequence[Press], *, modulus_factor: float = 1.0) -> Hold | None:
-    """How presses of a healthy organ were borne; None where none was complete.
+    """Hold of a healthy organ by its presses; None without a complete press.
 
     Args:
         anatomy: the organ.
-        presses: of it, healthy.
+        presses: of the organ without lesions.
         modulus_factor: of its tissue.
     """
-    whole = [one for one in presses if not one.end and one.depth > 0.0]
-    if not whole:
+    complete = [press for press in presses if not press.end and press.depth > 0.0]
+    if not complete:
         return None
     scene = anatomy.scene
-    expected = [modulus_factor * hertz_force(scene.material, scene.instrument.tip_radius, one.depth) for one in whole]
+    tip = scene.instrument.tip_radius
+    expected = [modulus_factor * hertz_force(scene.material, tip, press.depth) for press in complete]
     return Hold(
-        sites=np.array([one.site for one in whole]),
-        force=np.array([one.force for one in whole]),
+        sites=np.array([press.site for press in complete]),
+        force=np.array([press.force for press in complete]),
         expected=np.array(expected),
-        far_share=np.array([one.far_travel / one.depth for one in whole]),
+        far_share=np.array([press.far_travel / press.depth for press in complete]),
     )
 
 
@@ -100,11 +101,11 @@ def check_hold(
     *,
     progress: Callable[[], None] = lambda: None,
 ) -> Hold | None:
-    """Press up to SITES of some sites of the healthy organ, spread over them; see `hold_of`.
+    """Hold of an organ by healthy presses at up to SITES of its sites, spread over them.
 
     Args:
         anatomy: the organ.
-        sites: to choose from [m], shape (n_site, 3).
+        sites: of its raster [m], shape (n_site, 3).
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
     """
@@ -113,5 +114,6 @@ def check_hold(
     return hold_of(anatomy, presses)
 
 
-def _place(point: FloatArray) -> str:
+def place_text(point: FloatArray) -> str:
+    """Coordinates of a point (3,) [m] in millimetres."""
     return ", ".join(f"{value * 1e3:.1f}" for value in point)

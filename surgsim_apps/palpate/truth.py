@@ -1,4 +1,4 @@
-"""Where a hidden lesion is felt: the point of the pressable face from which a press strains it most."""
+"""Places of hidden lesions on the surface: points of the pressable face from which a press strains them most."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from msdm_core.material import Lesion, lesion_extent
 from msdm_core.mesh import FloatArray, IntArray, node_normals, triangle_lattice
 from surgsim_env.scene import Anatomy, contact_radius
 
-# Points of a lesion on a grid of so many along each of its axes, and points of a triangle by its split edges.
+# Points of a grid along each axis of a lesion, and parts of each edge of a triangle.
 GRID = 9
 SPLITS = 3
 
@@ -22,7 +22,7 @@ class Truth:
     Fields:
         name: of the lesion
         centre: its centre [m]                                                  (3,)
-        point: the point of the pressable face from which it is felt most [m]   (3,)
+        point: of the pressable face, from which it is felt most [m]            (3,)
         normal: unit outward normal there                                       (3,)
         radius: its largest half axis [m]
     """
@@ -35,10 +35,9 @@ class Truth:
 
 
 def seen_from_surface(lesions: Sequence[Lesion], anatomy: Anatomy) -> list[Truth]:
-    """The lesions with the pressable points from which they are felt most (`felt_weights`).
+    """Lesions with the pressable points of largest `felt_weights`.
 
-    That is the point of the palpable face nearest to the centre where it can be pressed and none is better, or where
-    nothing can be pressed.
+    The point of the palpable face nearest to the centre, where no pressable point is better.
     """
     face, truths = anatomy.face, []
     points, normals = _spread(face.points, face.normals, face.triangles[face.thickness >= face.thickness_smallest])
@@ -58,7 +57,7 @@ def seen_from_surface(lesions: Sequence[Lesion], anatomy: Anatomy) -> list[Truth
 
 
 def is_pressable(anatomy: Anatomy, point: FloatArray) -> bool:
-    """Whether a site may lie at a point of the palpable face [m] (3,): open, far from its border and what holds it."""
+    """True if a point of the palpable face [m] (3,) may be a site: open, away from the border and from supports."""
     face = anatomy.face
     inside = face.rim_distance(point) >= face.margin and face.is_open(point)
     return inside and bool(anatomy.clear_of_supports(point[None])[0])
@@ -71,16 +70,16 @@ def surface_points(anatomy: Anatomy) -> tuple[FloatArray, FloatArray]:
 
 
 def felt_weights(anatomy: Anatomy, lesion: Lesion, points: FloatArray, normals: FloatArray) -> FloatArray:
-    """How much of the strain of a press at each of some points lies in a lesion, in any unit, shape (n_point,).
+    """Share of a press's strain energy in a lesion at each point, up to a common factor, shape (n_point,).
 
-    A force P on a half space that does not change its volume strains it radially: s_RR = -3 P cos(a) / (2 pi R^2) at a
+    A force P on an incompressible half space stresses it radially: s_RR = -3 P cos(a) / (2 pi R^2) at a
     distance R in a direction a from its line (Boussinesq 1885 with nu = 1/2), an energy density in proportion to
-    (cos(a) / R^2)^2. A stiff inclusion changes the force, to first order, by the energy in its volume. Within the
-    contact the load is spread: R^2 becomes R^2 + a^2 with the contact's radius a.
+    (cos(a) / R^2)^2. To first order a stiff inclusion changes the force by the energy in its volume. The contact
+    spreads the load: R^2 becomes R^2 + a^2 with the contact's radius a.
 
     Args:
         anatomy: the organ.
-        lesion: in it.
+        lesion: in the organ.
         points: of the surface [m], shape (n_point, 3).
         normals: unit outward normals there, shape (n_point, 3).
     """
@@ -102,10 +101,10 @@ def felt_weights(anatomy: Anatomy, lesion: Lesion, points: FloatArray, normals: 
 def _spread(points: FloatArray, normals: FloatArray, triangles: IntArray) -> tuple[FloatArray, FloatArray]:
     counts, _ = triangle_lattice(SPLITS)
     shares = counts / SPLITS
-    place = matmul(shares, points[triangles]).reshape(-1, 3)
+    places = matmul(shares, points[triangles]).reshape(-1, 3)
     normal = matmul(shares, normals[triangles]).reshape(-1, 3)
     # Corners and edges belong to several triangles.
-    _, first = np.unique(np.round(place, 9), axis=0, return_index=True)
+    _, first = np.unique(np.round(places, 9), axis=0, return_index=True)
     first = np.sort(first)
     normal = normal[first]
-    return place[first], normal / norm(normal, axis=1)[:, None]
+    return places[first], normal / norm(normal, axis=1)[:, None]

@@ -1,1 +1,1 @@
-"""A patient's scan, or surfaces segmented from one, made into a scene: labels, mesh, materials, report."""
+"""Scenes of patients' organs from label images, surfaces and tets: mesh, materials, supports, report."""

@@ -1,4 +1,4 @@
-"""The direction from which a probe faces an organ's segmented lesions."""
+"""Approach of a probe to an organ's segmented lesions."""
 
 import numpy as np
 
@@ -8,15 +8,15 @@ from msdm_core.mesh import FloatArray, NearestTriangle, node_normals
 from surgsim_apps.patient.meshers import PatientMesh
 from surgsim_env.scene import Scene, Vector
 
-# Directions that are tried, spread evenly over the sphere (Fibonacci lattice): 9 degrees apart.
+# Directions spread evenly over the sphere (Fibonacci lattice), 9 degrees apart.
 DIRECTIONS = 500
-# Lesions within this angle of the border of the palpable face are near its rim, where no site lies [degrees].
+# Margin of a faced lesion to the border of the palpable face [degrees]: no site lies near its rim.
 MARGIN_DEG = 15.0
 ROUNDING = 1e-9
 
 
 def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) -> Vector:
-    """The approach that faces most segmented lesions, of those the one nearest to the usual one, of length 1.
+    """Approach of length 1 that faces most segmented lesions, nearest to the usual one.
 
     A lesion is faced if the inward normal at the surface point nearest to its centre is within the angle of the
     palpable face, less MARGIN_DEG, of the approach.
@@ -31,7 +31,7 @@ def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) 
     if len(inward) == 0:
         return usual
     least = cos(np.radians(face_angle_deg - MARGIN_DEG)) - ROUNDING
-    # Between two lesions a direction may face both that no direction of the lattice does.
+    # A direction between two lesions may face both, unlike any of the lattice.
     between = (inward[:, None] + inward[None]).reshape(-1, 3)
     length = norm(between, axis=1)
     between = between[length > ROUNDING] / length[length > ROUNDING, None]
@@ -44,7 +44,7 @@ def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) 
 
 
 def faced_note(patient: PatientMesh, scene: Scene) -> list[str]:
-    """A remark on the lesions that the scene's approach does not face, if there are any."""
+    """A note on lesions not faced by the scene's approach, if any."""
     cosines = matmul(_inward_normals(patient), np.asarray(scene.instrument.approach))
     angle = scene.palpation.face_angle_deg
     hidden = [name for name, cosine in zip(patient.lesions, cosines) if cosine < cos(np.radians(angle))]
@@ -62,13 +62,13 @@ def _inward_normals(patient: PatientMesh) -> FloatArray:
     mesh = patient.mesh
     triangles = mesh.boundary_triangles
     normals, nearest = node_normals(mesh.points, triangles), NearestTriangle(mesh.points[triangles])
-    found = np.zeros((len(patient.lesions), 3))
-    for row, name in zip(found, patient.lesions, strict=True):
+    inward = np.zeros((len(patient.lesions), 3))
+    for row, name in zip(inward, patient.lesions, strict=True):
         centre, _ = lesion_extent(mesh, Lesion(region=name, material=Material(1.0, 1.0), name=name))
         triangle, weights = nearest(centre)
         outward = matmul(weights, normals[triangles[triangle]])
         row[:] = -outward / norm(outward)
-    return found
+    return inward
 
 
 def _sphere() -> FloatArray:

@@ -1,4 +1,4 @@
-"""The fine surface of a scan, which pictures draw: from labels or a surface file, neither too fine nor too coarse."""
+"""Fine surface of an organ for pictures, from labels or a surface file."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -14,19 +14,19 @@ from surgsim_apps.patient.surface_files import Triangles, bodies_of
 from surgsim_env.rendering import BEND, smooth_normals
 from surgsim_env.scene import FineSurface, MeshSource, TetFile
 
-# Most triangles: a page in the browser then receives 240 kB for each picture.
+# Most triangles: 240 kB for each picture of a page in the browser.
 TRIANGLES_MOST = 40_000
 # Longest edge over that of the smallest cells: as with the smoothed boundary of a mesh.
 EDGE_PER_CELL = 0.5
-# Bending stops at vertices with a triangle that is turned by more than this from their normal: 30 degrees.
+# Vertices with a triangle turned by more than 30 degrees from their normal stay sharp.
 CREASE_COSINE = cos(np.radians(30.0))
 # Growth of a grid, or of the longest edge, from one try to the next.
 GROWTH = 1.1
 # Area of a triangle over its edge squared.
 EQUILATERAL = np.sqrt(3.0) / 4.0
-# A surface net has about this number of triangles per area of a cell's face.
+# Triangles of a surface net per area of a cell's face, about.
 TRIANGLES_PER_FACE = 3.0
-# Steps of Newton's method that move a net's vertices onto the level.
+# Steps of Newton's method from a net's vertices to the level.
 NEWTON_STEPS = 3
 CORNERS = np.array(list(product((0, 1), repeat=3)))
 EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
@@ -34,13 +34,13 @@ EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """A fine surface beside the mesh that carries it.
+    """Fine surface carried by a mesh.
 
     Fields:
         vertices: [m]                                                               (n_vertex, 3)
         triangles: outward                                                          (n_triangle, 3)
         apart: largest distance of a vertex from the tets' boundary [m]
-        moved: number of vertices that were too far from it to be carried, and lie on it
+        moved: number of vertices too far from it to be carried, moved onto it
     """
 
     vertices: FloatArray
@@ -51,8 +51,8 @@ class SurfaceFit:
     @property
     def text(self) -> str:
         """The surface in words."""
-        said = f"{len(self.triangles)} triangles, up to {self.apart * 1e3:.1f} mm from the tets' boundary"
-        return said + (f"; {self.moved} vertices that were farther from it lie on it" if self.moved else "")
+        text = f"{len(self.triangles)} triangles, up to {self.apart * 1e3:.1f} mm from the tets' boundary"
+        return text + (f"; {self.moved} vertices that were farther from it lie on it" if self.moved else "")
 
     def turned(self, origin: FloatArray, frame: FloatArray) -> "SurfaceFit":
         """The surface with each point p at (p - origin) frame, for an origin [m] (3,) and axes as columns (3, 3)."""
@@ -71,7 +71,7 @@ def surface_file(mesh_file: Path) -> Path:
 
 
 def mesh_source(mesh_file: Path, surface: SurfaceFit | None) -> MeshSource:
-    """A scene's source of the tets in a file beside it, with the fine surface beside them if there is one."""
+    """A scene's source of the tets in a file beside it, with their fine surface, if any."""
     fine = None if surface is None else FineSurface(surface_file(mesh_file).name, "m")
     return MeshSource(tets=TetFile(mesh_file.name, "m"), fine_surface=fine)
 
@@ -79,20 +79,20 @@ def mesh_source(mesh_file: Path, surface: SurfaceFit | None) -> MeshSource:
 def fitted_surface(
     vertices: FloatArray, triangles: Triangles, mesh: TetMesh, cell_size: float, triangles_most: int = TRIANGLES_MOST
 ) -> SurfaceFit:
-    """A closed surface with edges of at most EDGE_PER_CELL, so that dents show, and at most so many triangles.
+    """Closed surface with edges of at most EDGE_PER_CELL, for dents to show, and a largest number of triangles.
 
-    A part that is thinner than a cell has no tets: vertices too far from the mesh's boundary to be carried move to its
-    nearest point, and are counted.
+    Parts thinner than a cell have no tets: vertices too far from the mesh's boundary to be carried move to its nearest
+    point, and are counted.
 
     Args:
-        vertices: of the scan's surface [m], (n_vertex, 3).
+        vertices: of the organ's surface [m], (n_vertex, 3).
         triangles: outward, (n_triangle, 3).
         mesh: in the same axes.
         cell_size: edge of the smallest cells [m].
         triangles_most: largest number of triangles.
     """
     vertices, triangles = fewer_triangles(vertices, triangles, triangles_most)
-    # Triangles with shorter edges would be too many, however they lie.
+    # Shorter edges would make too many triangles in any case.
     longest = max(
         EDGE_PER_CELL * cell_size, float(np.sqrt(surface_area(vertices, triangles) / (EQUILATERAL * triangles_most)))
     )
@@ -101,16 +101,16 @@ def fitted_surface(
         longest *= GROWTH
         finer = split_edges(vertices, triangles, longest)
     vertices, triangles = finer
-    found = find_carriers(vertices, mesh)
-    placed = np.where(found.beyond[:, None], found.nearest, vertices)
-    carried = found.distance[~found.beyond]
-    return SurfaceFit(placed, triangles, float(carried.max(initial=0.0)), int(found.beyond.sum()))
+    carriers = find_carriers(vertices, mesh)
+    placed = np.where(carriers.beyond[:, None], carriers.nearest, vertices)
+    distance = carriers.distance[~carriers.beyond]
+    return SurfaceFit(placed, triangles, float(distance.max(initial=0.0)), int(carriers.beyond.sum()))
 
 
 def fewer_triangles(vertices: FloatArray, triangles: Triangles, triangles_most: int) -> tuple[FloatArray, Triangles]:
-    """A surface with at most so many triangles: vertices in one cell of a grid become their mean.
+    """Surface with a largest number of triangles: vertices in a cell of a grid become their mean.
 
-    Rossignac & Borrel 1993, with the finest grid that suffices; unchanged where it has no more.
+    Rossignac & Borrel 1993, with the finest grid that suffices; a surface with few triangles stays unchanged.
     """
     if len(triangles) <= triangles_most:
         return vertices, triangles
@@ -141,14 +141,14 @@ def surface_area(vertices: FloatArray, triangles: NDArray[np.integer]) -> float:
 
 
 def split_edges(vertices: FloatArray, triangles: Triangles, longest: float) -> tuple[FloatArray, Triangles]:
-    """A surface whose edges are no longer than a length [m]: longer ones are halved, in both triangles beside them.
+    """Surface with edges up to a length [m]: longer ones are halved, in both triangles beside them.
 
-    A half lies BEND of the way from the edge to the tangent planes of its ends (Boubekeur & Alexa 2008), so that flat
-    triangles of a smooth scan show no facets; at creases it lies on the edge.
+    The new vertex lies BEND of the way from the edge to the tangent planes of its ends (Boubekeur & Alexa 2008): flat
+    triangles of a smooth scan show no facets. At creases it lies on the edge.
     """
     while True:
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        # As one number each, which is sorted faster than two.
+        # A single number sorts faster than two.
         keys, side_edge = np.unique(sides[:, 0] * len(vertices) + sides[:, 1], return_inverse=True)
         edges = np.column_stack([keys // len(vertices), keys % len(vertices)])
         long = norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > longest
@@ -179,12 +179,12 @@ def _parts(triangles: Triangles, middle: Triangles) -> list[Triangles]:
     """The triangles, divided at the middles (n, 3) of their sides 01, 12, 20; -1 for a side that stays."""
     count = (middle >= 0).sum(axis=1)
     parts = [triangles[count == 0]]
-    # Turned so that the only halved side, or the only whole one, is the first.
+    # Turned until the only halved side, or the only whole one, is the first.
     for halved, odd in ((1, middle >= 0), (2, middle < 0)):
-        some = count == halved
-        turn = (odd[some].argmax(axis=1)[:, None] + np.arange(3)) % 3
-        a, b, c = np.take_along_axis(triangles[some], turn, axis=1).T
-        ab, bc, ca = np.take_along_axis(middle[some], turn, axis=1).T
+        chosen = count == halved
+        turn = (odd[chosen].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(triangles[chosen], turn, axis=1).T
+        ab, bc, ca = np.take_along_axis(middle[chosen], turn, axis=1).T
         if halved == 1:
             parts += [np.column_stack([a, ab, c]), np.column_stack([ab, b, c])]
         else:
@@ -198,22 +198,22 @@ def _parts(triangles: Triangles, middle: Triangles) -> list[Triangles]:
 def level_surface(
     field: SmoothedShare, volume: float, area: float, triangles_most: int = TRIANGLES_MOST
 ) -> tuple[FloatArray, Triangles]:
-    """The largest level set of a smoothed label, at the level above which it has a volume.
+    """Largest level set of a smoothed label that encloses a volume.
 
-    A surface net (Gibson 1998): a vertex in each cell of a grid that the level crosses, a quadrangle across each line
-    of it; Newton's method then moves the vertices onto the level.
+    A surface net (Gibson 1998): a vertex in each cell of a grid crossed by the level, a quadrangle across each crossed
+    line of the grid; Newton's method then moves the vertices onto the level.
 
     Args:
         field: the smoothed label.
         volume: to be enclosed [m^3].
         area: of the surface, about [m^2]; the grid's cells follow from it.
-        triangles_most: the number of triangles for which the cells are chosen; there may be some more.
+        triangles_most: number of triangles for the choice of the cells; the surface may have a few more.
 
     Returns:
         Vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3), in the field's axes.
     """
     level = field.level_of(volume)
-    # Finer than the blocks there is nothing to see.
+    # Cells finer than the field's blocks show nothing.
     step = max(float(field.step.min()), float(np.sqrt(TRIANGLES_PER_FACE * area / triangles_most)))
     # Beyond the blocks the field is 0.
     low, extent = field.start - 1.5 * step, np.array(field.values.shape) * field.step + 3.0 * step
@@ -233,7 +233,7 @@ def level_surface(
 
 
 def _surface_net(values: NDArray[np.float32]) -> tuple[FloatArray, Triangles]:
-    """Vertices in grid coordinates (n, 3) and quadrangles (m, 4) of the net where values change their sign."""
+    """Vertices in grid coordinates (n, 3) and quadrangles (m, 4) of the net between positive and other values."""
     inside = values > 0.0
     a, b, c = (side - 1 for side in values.shape)
     count = np.zeros((a, b, c), dtype=np.int8)
@@ -242,7 +242,7 @@ def _surface_net(values: NDArray[np.float32]) -> tuple[FloatArray, Triangles]:
     cells = np.argwhere((count > 0) & (count < 8))
     number = np.full(count.shape, -1, dtype=np.int64)
     number[tuple(cells.T)] = np.arange(len(cells))
-    corner = np.stack([values[tuple((cells + one).T)] for one in CORNERS], axis=1).astype(np.float64)
+    corner = np.stack([values[tuple((cells + offset).T)] for offset in CORNERS], axis=1).astype(np.float64)
     total, crossings = np.zeros((len(cells), 3)), np.zeros(len(cells))
     for a, b in EDGES:
         crossed = (corner[:, a] > 0.0) != (corner[:, b] > 0.0)
@@ -264,7 +264,7 @@ def _surface_net(values: NDArray[np.float32]) -> tuple[FloatArray, Triangles]:
 
 def _towards_level(field: SmoothedShare, level: float, places: FloatArray, step: float) -> FloatArray:
     """Newton's step along the slope to the level, of at most `step` [m], (n, 3)."""
-    slope = np.column_stack([(field.at(places + one) - field.at(places - one)) for one in step * np.eye(3)])
+    slope = np.column_stack([(field.at(places + shift) - field.at(places - shift)) for shift in step * np.eye(3)])
     slope /= 2.0 * step
     move = slope * ((level - field.at(places)) / np.maximum((slope * slope).sum(axis=1), 1e-300))[:, None]
     size = norm(move, axis=1, keepdims=True)
@@ -272,9 +272,8 @@ def _towards_level(field: SmoothedShare, level: float, places: FloatArray, step:
 
 
 def _triangles_of(vertices: FloatArray, quads: Triangles) -> Triangles:
-    """Two triangles of each quadrangle, divided along the shorter diagonal."""
+    """Triangles of quadrangles divided along the shorter diagonal."""
     a, b, c, d = quads.T
     short = norm(vertices[a] - vertices[c], axis=1) <= norm(vertices[b] - vertices[d], axis=1)
-    one, other = quads[short], quads[~short]
-    parts = [one[:, [0, 1, 2]], one[:, [0, 2, 3]], other[:, [0, 1, 3]], other[:, [1, 2, 3]]]
-    return np.concatenate(parts)
+    ac, bd = quads[short], quads[~short]
+    return np.concatenate([ac[:, [0, 1, 2]], ac[:, [0, 2, 3]], bd[:, [0, 1, 3]], bd[:, [1, 2, 3]]])

@@ -1,7 +1,4 @@
-"""The chosen labels of a scan: cropped, with their geometry in the patient, and made one connected part for meshing.
-
-Each lesion becomes a region of its own, and cavities are filled on request.
-"""
+"""Chosen labels of a scan: cropped, placed in the patient, and reduced to one connected part for meshing."""
 
 import re
 from collections.abc import Sequence
@@ -19,10 +16,9 @@ from surgsim_apps.patient.materials import check_name, is_lesion
 
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
 FORM = "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2"
-# A lesion smaller than a ball of half a cell's radius cannot be shown (the rule of
-# `msdm_core.material.regions.Lesion`).
+# Smallest volume of a lesion over a cell's: a ball of half a cell's radius (the rule of `msdm_core.material.Lesion`).
 SMALLEST_SHARE_OF_CELL = np.pi / 6.0
-# Of a label's parts at most this many, the largest, are lesions; the rest is noise.
+# Most lesions of a label, the largest of its parts; the others are noise.
 PARTS_MOST = 24
 # Tags are bytes, and 0 is outside.
 NAMES_MOST = 255
@@ -37,23 +33,22 @@ class LabelName:
 
 
 def parse_labels(text: str) -> tuple[LabelName, ...]:
-    """The tissues of a text such as "liver=1,lesion=2", the organ first.
+    """Tissues of a text such as "liver=1,lesion=2", the organ first.
 
     Raises:
         MeshError: a part that breaks the form, a name or a label given twice.
     """
     names = []
     for part in text.split(","):
-        name, found, value = part.partition("=")
+        name, equals, value = part.partition("=")
         name = name.strip()
-        if not found or not re.fullmatch(r"\s*\d{1,10}\s*", value):
+        if not equals or not re.fullmatch(r"\s*\d{1,10}\s*", value):
             raise MeshError(f"--labels: {part!r} is no NAME=LABEL; give {FORM}")
         if int(value) == 0:
             raise MeshError(f"--labels: {part!r}: label 0 is outside; give {FORM}")
         names.append(LabelName(check_name(name, "--labels"), int(value)))
-    for what in ("name", "value"):
-        given = [getattr(one, what) for one in names]
-        twice = next((one for one in given if given.count(one) > 1), None)
+    for entries in ([label.name for label in names], [label.value for label in names]):
+        twice = next((entry for entry in entries if entries.count(entry) > 1), None)
         if twice is not None:
             raise MeshError(f"--labels: {twice!r} is given twice; each tissue has one label of its own")
     return tuple(names)
@@ -86,21 +81,21 @@ class LabelImage:
 
 
 def is_image(file: Path) -> bool:
-    """Whether a file has an extension of label images."""
+    """True for an extension of label images."""
     return file.name.lower().endswith(IMAGE_SUFFIXES)
 
 
 def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
-    """Read the named labels of an image file, which is held as a whole.
+    """Read the named labels of an image file.
 
     Raises:
-        MeshError: a file that is missing or that its library cannot read, sheared or not of three axes;
-            values that are not whole numbers; a label that is nowhere in it (lists those that are).
+        MeshError: a file that is missing, unreadable, sheared or not of three axes; values that are not whole numbers;
+            a label that is nowhere in it (lists those that are).
     """
     if not file.is_file():
         raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
     source = read_labels(file, [label.value for label in labels])
-    found = np.zeros(source.values.shape, dtype=np.uint8)
+    tags = np.zeros(source.values.shape, dtype=np.uint8)
     for tag, label in enumerate(labels, start=1):
         chosen = source.values == label.value
         if not chosen.any():
@@ -108,24 +103,24 @@ def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
                 f"{file}: label {label.value} ({label.name!r}) is nowhere in the image; there are {_there(source)}: "
                 "correct --labels"
             )
-        found[chosen] = tag
-    return _cut(found, labels, source)
+        tags[chosen] = tag
+    return _cropped(tags, labels, source)
 
 
 def _there(source: LabelSource) -> str:
     known = [int(value) for value in np.unique(source.values) if value]
-    more = ", ..." if len(known) > 20 else ""
-    return f"labels {', '.join(map(str, known[:20]))}{more}" if known else "no labels at all, every voxel is 0"
+    dots = ", ..." if len(known) > 20 else ""
+    return f"labels {', '.join(map(str, known[:20]))}{dots}" if known else "no labels at all, every voxel is 0"
 
 
-def _cut(found: NDArray[np.uint8], labels: Sequence[LabelName], source: LabelSource) -> LabelImage:
+def _cropped(tags: NDArray[np.uint8], labels: Sequence[LabelName], source: LabelSource) -> LabelImage:
     box = []
     for axis in range(3):
-        used = np.flatnonzero(found.any(axis=tuple({0, 1, 2} - {axis})))
+        used = np.flatnonzero(tags.any(axis=tuple({0, 1, 2} - {axis})))
         box.append(slice(int(used[0]), int(used[-1]) + 1))
-    x, y, z = (one.start for one in box)
+    x, y, z = (span.start for span in box)
     return LabelImage(
-        np.ascontiguousarray(found[tuple(box)]),
+        np.ascontiguousarray(tags[tuple(box)]),
         tuple(label.name for label in labels),
         source.geometry.moved(np.array([x, y, z], dtype=np.float64)),
         (x, y, z),
@@ -141,8 +136,8 @@ class CleanLabels:
     Fields:
         tags: n for the n-th of `names`, counted from 1, 0 outside       (n_x, n_y, n_z) uint8
         names: the organ first; parts of a lesion's label are numbered, the largest first
-        lesions: names of the regions that are lesions
-        notes: remarks on what was dropped, filled or is unusual
+        lesions: names of the lesions' regions
+        notes: remarks on dropped, filled and unusual parts
         image: the labels before cleaning
     """
 
@@ -154,7 +149,7 @@ class CleanLabels:
 
 
 def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLabels:
-    """The largest part of the labels, with its lesions as regions of their own, its cavities filled if `mend`.
+    """Largest part of the labels, with its lesions as regions of their own, its cavities filled if `mend`.
 
     A part of a lesion too small for the cells becomes healthy tissue, with a note.
 
@@ -162,8 +157,8 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
         MeshError: numbering the lesions gives two regions the same name, or there are more regions than tags.
     """
     tags, notes = _one_part(image)
-    filled, more = _cavities(tags, image, mend)
-    notes += [*_at_border(tags, image), *more]
+    filled, cavity_notes = _cavities(tags, image, mend)
+    notes += [*_at_border(tags, image), *cavity_notes]
     names = [image.names[0]]
     result, lesions = np.where(filled > 0, np.uint8(1), np.uint8(0)), list[str]()
     smallest = SMALLEST_SHARE_OF_CELL * (cell_size * cell_size * cell_size)
@@ -182,17 +177,16 @@ def clean_labels(image: LabelImage, *, cell_size: float, mend: bool) -> CleanLab
             )
         added = [name if count == 1 else f"{name} {number}" for number in range(1, count + 1)]
         _check_names(names, added, name)
-        for number, one in enumerate(ndimage.find_objects(numbers), start=1):
-            # One bounding box at a time: a mask of the whole image takes a byte a voxel.
-            result[one][numbers[one] == number] = len(names) + number
+        for number, box in enumerate(ndimage.find_objects(numbers), start=1):
+            # A mask of the whole image would take a byte a voxel.
+            result[box][numbers[box] == number] = len(names) + number
         names += added
         lesions += added if is_lesion(name) else []
     return CleanLabels(result, tuple(names), tuple(lesions), tuple(notes), image)
 
 
 def _one_part(image: LabelImage) -> tuple[NDArray[np.uint8], list[str]]:
-    every = list(range(1, len(image.names) + 1))
-    organ, corner, dropped = largest_part(image.tags, every)
+    organ, corner, dropped = largest_part(image.tags, list(range(1, len(image.names) + 1)))
     tags = np.zeros_like(image.tags)
     box = tuple(slice(low, low + n) for low, n in zip(corner, organ.shape, strict=True))
     tags[box] = np.where(organ, image.tags[box], 0)
@@ -232,9 +226,9 @@ def _cavities(tags: NDArray[np.uint8], image: LabelImage, mend: bool) -> tuple[N
 
 
 def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> tuple[NDArray[np.uint8], int, int, int]:
-    """The parts of a mask with at least `smallest` voxels, largest first; without `split` the mask is one part.
+    """Numbers from 1 of the parts of a mask with at least `smallest` voxels, largest first, 0 elsewhere.
 
-    Returns: those kept, numbered from 1 (0 elsewhere), their count, and the count and voxels of the rest.
+    Beside them their count, and count and voxels of the other parts; without `split` the mask is a single part.
     """
     if not split:
         count = int(np.count_nonzero(chosen))
@@ -249,7 +243,7 @@ def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> tuple[
 
 
 def _check_names(names: list[str], added: list[str], label: str) -> None:
-    """Raise a MeshError for a name that is taken, or for more regions than there are tags."""
+    """Refuse a name that is taken, and more regions than tags."""
     twice = next((name for name in added if name in names), None)
     if twice is not None:
         raise MeshError(

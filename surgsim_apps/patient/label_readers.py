@@ -1,4 +1,4 @@
-"""Readers of label images, NIfTI, NRRD, MetaImage and DICOM: geometry in the patient, and voxels."""
+"""Readers of label images in NIfTI, NRRD, MetaImage and DICOM: geometry in the patient, and voxels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from msdm_core.mesh_files import parsed
 
 # The axes of a scan's mesh, in words.
 CONVENTION = "x to the patient's left, y to the back, z to the head (LPS, as DICOM), metres, the scanner's own origin"
-# Two axes are at right angles up to this cosine of the angle between them; headers hold 32-bit numbers.
+# Largest cosine of the angle between two axes at right angles; headers hold 32-bit numbers.
 COSINE_LARGEST = 1e-3
-# Smallest and largest voxel spacing that is accepted [m].
+# Smallest and largest accepted voxel spacing [m].
 SPACING_RANGE = (1e-5, 0.05)
 AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
 # NIfTI's axes are RAS: x to the right and y to the front.
@@ -25,7 +25,7 @@ RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
-# Frame positions may be off the grid by this share of the slice step, or of 1 mm where slices are thinner.
+# Largest distance of frames off the grid, over the slice step, or over 1 mm for thinner slices.
 SLACK = 0.02
 
 
@@ -45,7 +45,7 @@ class ImageGeometry:
 
     @classmethod
     def from_matrix(cls, matrix: FloatArray, origin: FloatArray, file: Path) -> "ImageGeometry":
-        """The geometry of a header.
+        """Geometry of a header.
 
         Args:
             matrix: the step from voxel to voxel along each axis of the image, as columns, LPS (3, 3) [m].
@@ -58,7 +58,7 @@ class ImageGeometry:
         spacing = norm(matrix, axis=0)
         low, high = SPACING_RANGE
         if not ((spacing >= low) & (spacing <= high)).all():
-            shown = " x ".join(f"{one * 1e3:.4g}" for one in spacing)
+            shown = " x ".join(f"{length * 1e3:.4g}" for length in spacing)
             raise MeshError(
                 f"{file}: the header's voxels are {shown} mm; the rule is {low * 1e3:g} to {high * 1e3:g} mm a side: "
                 "is the header's length unit right?"
@@ -77,15 +77,15 @@ class ImageGeometry:
         return cls(spacing, matmul(left, right), np.asarray(origin, dtype=np.float64))
 
     def moved(self, corner: FloatArray) -> "ImageGeometry":
-        """The geometry of a part of the image that begins at voxel `corner` (3,)."""
+        """Geometry of a part of the image from voxel `corner` (3,) on."""
         return ImageGeometry(self.spacing, self.direction, self.places(np.asarray(corner) * self.spacing))
 
     def places(self, points: FloatArray) -> FloatArray:
-        """LPS positions (..., 3) [m] of points given along the image's axes from voxel (0, 0, 0), (..., 3) [m]."""
+        """LPS positions (..., 3) [m] of points along the image's axes from voxel (0, 0, 0), (..., 3) [m]."""
         return self.origin + matmul(points, self.direction.T)
 
     def side(self, axis: int, *, high: bool) -> str:
-        """The patient's side to which an axis of the image begins or ends, such as "head"."""
+        """Side of the patient at the beginning or end of an axis, such as "head"."""
         along = self.direction[:, axis]
         main = int(np.argmax(np.abs(along)))
         return AXES[main][int((along[main] > 0) == high)]
@@ -93,7 +93,7 @@ class ImageGeometry:
 
 @dataclass(frozen=True, eq=False)
 class LabelSource:
-    """An image file that was read.
+    """Contents of an image file.
 
     Fields:
         file: its path
@@ -113,11 +113,10 @@ def read_labels(file: Path, wanted: Sequence[int]) -> LabelSource:
 
     Args:
         file: the file.
-        wanted: segment numbers of a DICOM segmentation; where segments overlap, the later one in this list applies.
+        wanted: segment numbers of a DICOM segmentation; of overlapping segments the later in this list applies.
 
     Raises:
-        MeshError: a file that its library cannot read, an image that is sheared or not of three axes,
-            voxels that are no whole numbers.
+        MeshError: an unreadable file, an image that is sheared or not of three axes, voxels that are no whole numbers.
     """
     return parsed(file, lambda _: _read(file, wanted), "export or copy it again")
 
@@ -136,7 +135,7 @@ def _read(file: Path, wanted: Sequence[int]) -> LabelSource:
 
 
 def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
-    """The three voxel counts of a header; further axes of length 1 are dropped.
+    """Voxel counts of a header's three axes; further axes of length 1 are dropped.
 
     Raises:
         MeshError: fewer or more axes.
@@ -153,12 +152,12 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
 
 
 def check_whole(values: NDArray, file: Path) -> None:
-    """Raise a MeshError for values that are no numbers, with the first that is not a whole number."""
+    """Refuse values that are no whole numbers."""
     if values.dtype.kind not in "iubf":
         raise MeshError(f"{file}: the image's values are {values.dtype}; labels are whole numbers: export a label map")
     if values.dtype.kind != "f":
         return
-    # numpy warns of a NaN of another kind than its own; all are wrong here.
+    # numpy warns of signalling NaNs; all are wrong here.
     with np.errstate(invalid="ignore"):
         wrong = (values != np.rint(values)) | ~np.isfinite(values)
     if wrong.any():
@@ -217,7 +216,7 @@ def _read_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
     kind = str(data.SegmentationType)
     if kind not in ("BINARY", "LABELMAP"):
         raise MeshError(f"{file}: its segments are {kind:.80}; the rule is BINARY or LABELMAP: export it so")
-    segments = {int(one.SegmentNumber): str(one.SegmentLabel) for one in data.SegmentSequence}
+    segments = {int(segment.SegmentNumber): str(segment.SegmentLabel) for segment in data.SegmentSequence}
     missing = [number for number in wanted if number not in segments]
     if missing:
         there = ", ".join(f"{number} ({name!r})" for number, name in sorted(segments.items())[:20])
@@ -231,8 +230,8 @@ def _read_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
         for frame, place in enumerate(slices):
             values[..., place] = pixels[frame].T
         return LabelSource(file, values, geometry)
-    groups = [_group(data, one, "SegmentIdentificationSequence") for one in frames]
-    numbers = np.array([int(one.ReferencedSegmentNumber) for one in groups])
+    groups = [_group(data, frame, "SegmentIdentificationSequence") for frame in frames]
+    numbers = np.array([int(group.ReferencedSegmentNumber) for group in groups])
     for number in wanted:
         for frame in np.flatnonzero(numbers == number):
             values[pixels[frame].T > 0, slices[frame]] = number
@@ -240,13 +239,14 @@ def _read_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
 
 
 def _group(data: Any, frame: Any, name: str) -> Any:
-    """The first item of a functional group: the frame's own, else the one shared by all frames."""
+    """First item of a functional group: the frame's own, else that of all frames."""
     return (frame if name in frame else data.SharedFunctionalGroupsSequence[0])[name][0]
 
 
 def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeometry, NDArray[np.int64]]:
-    """The geometry of the stack and the slice of each frame (n_frame,)."""
-    turns = {tuple(map(float, _group(data, one, "PlaneOrientationSequence").ImageOrientationPatient)) for one in frames}
+    """Geometry of the stack, and slice of each frame (n_frame,)."""
+    planes = [_group(data, frame, "PlaneOrientationSequence") for frame in frames]
+    turns = {tuple(map(float, plane.ImageOrientationPatient)) for plane in planes}
     measures = _group(data, frames[0], "PixelMeasuresSequence")
     if len(turns) != 1:
         raise MeshError(
@@ -254,7 +254,8 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
         )
     turn = np.array(turns.pop()).reshape(2, 3)
     normal = np.cross(turn[0], turn[1])
-    places = np.array([_group(data, one, "PlanePositionSequence").ImagePositionPatient for one in frames], dtype=float)
+    positions = [_group(data, frame, "PlanePositionSequence") for frame in frames]
+    places = np.array([position.ImagePositionPatient for position in positions], dtype=float)
     along = matmul(places, normal)
     step = _slice_step(file, along, measures)
     slices = np.rint((along - along.min()) / step).astype(np.int64)
@@ -271,10 +272,10 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
 
 
 def _slice_step(file: Path, along: FloatArray, measures: Any) -> float:
-    """Distance between slices [mm], from the frames' positions along the normal [mm]; for one slice the stated one."""
+    """Distance between slices [mm] by the frames' positions along the normal [mm]; of a single slice as stated."""
     apart = np.diff(np.unique(np.round(along, 3)))
     if len(apart):
-        # Averaged over the whole stack, so that rounded positions do not add up to an error.
+        # The mean over the stack is free of the positions' rounding.
         return float(np.ptp(along) / max(round(np.ptp(along) / apart.min()), 1))
     stated = measures.get("SpacingBetweenSlices") or measures.get("SliceThickness")
     if stated is None:

@@ -1,4 +1,4 @@
-"""Whether an organ has room for hidden lesions of given ranges, from one sample of its palpable face."""
+"""Room of an organ for hidden lesions of given ranges, by a sample of its palpable face."""
 
 import math
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ from msdm_core.arithmetic import norm
 from msdm_core.mesh import FloatArray
 from surgsim_env.scene import LESION_GAP, LEVELS, REFERENCE_TIP, Anatomy, LesionDraw
 
-# Points of the face that are tried.
+# Sampled points of the face.
 POINTS = 200
-# Least share of them below which the largest lesion fits: all 200 draws of a lesion then fail once in 3500 times.
+# Least share of the points with room for the largest lesion: all 200 draws of a lesion then fail once in 3500 times.
 SHARE_LEAST = 0.04
-# Orders in which lesions are placed beside each other, and the least share of them in which all find a place: a level
-# draws all lesions up to 200 times, which then fails once in 10^9 times, and once in 3000 at a share of 0.04.
+# Random orders of lesions placed beside each other, and least share of orders with a place for all: the up to 200 draws
+# of a level then fail once in 10^9 times, and once in 3000 at a share of 0.04.
 ORDERS, ORDERS_LEAST = 40, 0.1
 
 
@@ -23,9 +23,9 @@ class FaceSample:
     """Random points of a palpable face.
 
     Fields:
-        anatomy: whose face it is
+        anatomy: of the face
         points, normals: on the face [m], and unit outward normals      (n, 3)
-        thick: whether the organ is thick enough below to be pressed     (n,)
+        thick: true for a point with enough organ below to be pressed    (n,)
         rim: distance from the face's border [m]                         (n,)
     """
 
@@ -37,7 +37,7 @@ class FaceSample:
 
 
 def sample_face(anatomy: Anatomy) -> FaceSample:
-    """POINTS points of the palpable face of an anatomy, the same each time."""
+    """Sample of POINTS points of an anatomy's palpable face, the same each time."""
     face = anatomy.face
     points, normals, thickness = face.random_points(np.random.default_rng(0), POINTS)
     rim = np.array([face.rim_distance(point) for point in points])
@@ -45,15 +45,15 @@ def sample_face(anatomy: Anatomy) -> FaceSample:
 
 
 def lack_of_room(sample: FaceSample, draw: LesionDraw) -> str:
-    """Why lesions of these ranges do not fit at every level; empty if they do.
+    """Reason for ranges of lesions that do not fit at every level; empty for a fit.
 
-    At each level the largest lesion under the thickest cover must fit below SHARE_LEAST of the points, and in
-    ORDERS_LEAST of some random orders as many lesions of the middle size as the level hides must fit beside each other.
+    At each level the largest lesion under the thickest cover must fit below SHARE_LEAST of the points, and all lesions
+    of the level, of the middle size, must fit beside each other in ORDERS_LEAST of some random orders.
     """
     scene, order = sample.anatomy.scene, np.random.default_rng(0)
     gap = LESION_GAP * scene.instrument.tip_radius / REFERENCE_TIP
     # A draw without a level has the scene's own ranges; levels may exceed them.
-    levels = [(len(one.lesion_count_weights) - 1, one.ranges(draw)) for one in LEVELS.values()]
+    levels = [(len(level.lesion_count_weights) - 1, level.ranges(draw)) for level in LEVELS.values()]
     for count, ranges in [(1, draw), *levels]:
         allowed = sample.thick & (sample.rim >= ranges.rim_distance)
         fitting = _centres(sample, allowed, ranges.radius[1], ranges.cover[1])
@@ -76,13 +76,13 @@ def lack_of_room(sample: FaceSample, draw: LesionDraw) -> str:
 
 
 def _centres(sample: FaceSample, allowed: np.ndarray, radius: float, cover: float) -> FloatArray:
-    """Centres of balls under some tissue [m] below the allowed points where they fit (n, 3)."""
+    """Centres of balls that fit under a cover [m] below the allowed points (n, 3)."""
     centres = sample.anatomy.centres_below(sample.points[allowed], sample.normals[allowed], radius + cover)
     return centres[np.isfinite(centres).all(axis=1)]
 
 
 def _placed(centres: FloatArray, count: int, apart: float) -> int:
-    """How many of `count` balls are placed if each takes the first centre (n, 3) that is far enough from the rest."""
+    """Number of up to `count` balls with a place, if each takes the first centre (n, 3) far enough from the others."""
     free, placed = centres, 0
     while len(free) and placed < count:
         placed += 1

@@ -1,4 +1,4 @@
-"""Materials of tissues by their names, each with its source; an unknown tissue takes the liver's, and says so."""
+"""Materials of tissues by their names, each with its source."""
 
 import re
 from collections.abc import Mapping
@@ -39,13 +39,16 @@ LESIONS: Mapping[str, tuple[float, str]] = {
 }
 KIDNEY_LESION = (4.0, "chosen: strain index of renal cell carcinoma 4.04 +- 0.72 (PMID 26880174)")
 GIVEN = "given on the command line"
-# Names are written into mesh files, TOML and HTML.
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_ .-]{0,39}")
 LESION_WORD = re.compile(r"lesion|tumou?r|metastas|carcinoma|hcc|nodule|mass|cancer|adenoma|fnh", re.IGNORECASE)
 
 
 def check_name(name: str, option: str) -> str:
-    """The name, if a region may have it; raises a MeshError with the option and the rule otherwise."""
+    """The name of a region as given.
+
+    Raises:
+        MeshError: characters that mesh files, TOML and HTML do not all take, with the option and the rule.
+    """
     if not NAME.fullmatch(name) or name != name.strip():
         raise MeshError(
             f"{option}: {name!r} cannot be a region's name; use letters, digits, blanks and _ . - (at most 40)"
@@ -54,7 +57,7 @@ def check_name(name: str, option: str) -> str:
 
 
 def is_lesion(name: str) -> bool:
-    """Whether a region's name is that of a lesion, which palpation looks for."""
+    """True for the name of a lesion."""
     return LESION_WORD.search(name) is not None
 
 
@@ -64,7 +67,7 @@ def without_number(name: str) -> str:
 
 
 def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMaterial:
-    """Material of an organ by its name, such as "liver" or "left kidney", or with a given modulus [Pa]."""
+    """Material of an organ by its name, such as "left kidney", or with a given modulus [Pa]; else the liver's."""
     if youngs_modulus is not None:
         modulus, source = youngs_modulus, GIVEN
     else:
@@ -74,7 +77,7 @@ def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMate
 
 
 def _known(name: str) -> tuple[float, str] | None:
-    """Modulus [Pa] and source of the first organ whose word is in a name."""
+    """Modulus [Pa] and source of the first organ in a name."""
     return next((entry for word, entry in ORGANS.items() if word in name.lower()), None)
 
 

@@ -1,4 +1,4 @@
-"""An organ's mesh with its regions, from a label image or from closed surfaces, by the lattice or by fTetWild."""
+"""Meshes of organs with regions from label images or closed surfaces, by the lattice or by fTetWild."""
 
 import contextlib
 import math
@@ -44,7 +44,7 @@ from surgsim_apps.patient.surface_files import (
 )
 from surgsim_env.scene import Vector
 
-# A default mesh with a smaller dihedral angle [degrees] is made again with cells scaled by the next share.
+# Least dihedral angle of a default mesh [degrees]; below it the next share scales the cells.
 DIHEDRAL_SMALLEST = 10.0
 CELL_SHARES = (1.0, 0.98, 0.96, 0.94)
 FILE_CONVENTION = "the files' own axes and origin, in metres"
@@ -52,17 +52,17 @@ FILE_CONVENTION = "the files' own axes and origin, in metres"
 CELL_VOXELS = 8
 # At least this share of a region must lie inside the organ.
 SHARE_INSIDE = 0.5
-# Ratio of fTetWild's target edge to the lattice's cell that gives about as many tets.
+# fTetWild's target edge over the lattice's cell, for about as many tets.
 EDGE_PER_CELL = 0.9
 # Largest distance of its surface from the given one over the bounding box's diagonal: fTetWild's default.
 EPSILON = 1e-3
-# Voxels along a region's longest extent, by which its tets are found.
+# Voxels along a region's longest extent, to find its tets.
 REGION_VOXELS = 160
 
 
 @dataclass(frozen=True)
 class RegionVolume:
-    """Volume of one region in its source and in the mesh [m^3]."""
+    """Volume of a region in its source and in the mesh [m^3]."""
 
     name: str
     source: float
@@ -70,25 +70,25 @@ class RegionVolume:
 
     @property
     def error(self) -> float:
-        """(mesh - source) / source."""
+        """Relative error, (mesh - source) / source."""
         return self.mesh / self.source - 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class PatientMesh:
-    """An organ's mesh and its sources.
+    """Mesh of an organ and its sources.
 
     Fields:
         mesh: with named regions, the organ's own first; in metres
-        lesions: names of the regions that are lesions
+        lesions: names of the lesions' regions
         volumes: of the whole organ, under its name, then of each region
-        cell_size, coarsening, mesher: how it was made; the size is that of the fine cells [m], and the largest cells
-            are `coarsening` times as long
+        cell_size, coarsening, mesher: edge of the fine cells [m], edge of the largest over that of the fine, name of
+            the mesher
         convention: the meaning of its axes, in words
         sources: names of the files
-        is_scan: whether the axes are the patient's (LPS)
-        surface: of the scan, for pictures; None where the mesh's boundary is all there is
-        notes: remarks on what was dropped, repaired or is unusual
+        is_scan: true for the axes of a patient (LPS)
+        surface: of the scan, for pictures; None for the mesh's boundary
+        notes: remarks on dropped, repaired and unusual parts
     """
 
     mesh: TetMesh
@@ -110,7 +110,7 @@ class PatientMesh:
 
     @property
     def cells_text(self) -> str:
-        """Its cells in words."""
+        """The cells in words."""
         graded = f" at the pressed face, {self.coarsening} times as long elsewhere" if self.coarsening > 1 else ""
         return f"cells of {self.cell_size * 1e3:.4g} mm{graded}"
 
@@ -122,13 +122,13 @@ class PatientMesh:
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a mesh.
+    """Cells of a mesh.
 
     Fields:
         size: edge of the lattice's cells, of the fine ones where it is graded [m]
-        is_given: whether the size is the user's; else slightly smaller cells are tried for better angles
+        is_given: true for a size of the user; else slightly smaller cells are tried for better angles
         coarsening: edge of the largest cells over that of the fine ones, 1, 2 or 4; the lattice's alone
-        fine_depth: cells are fine to this depth under the face that faces the approach [m]
+        fine_depth: of fine cells under the face towards the approach [m]
         approach, face_angle_deg: direction of the probe in the organ's axes, and angle of that face [degrees]
     """
 
@@ -141,7 +141,7 @@ class Cells:
 
 
 def well_shaped(make: Callable[[float], PatientMesh], cells: Cells) -> PatientMesh:
-    """A mesh of given cells; with slightly smaller ones for better angles where the size is not the user's.
+    """Mesh of given cells, or of slightly smaller ones for better angles if the size is not the user's.
 
     Isosurface stuffing guarantees 9.3 degrees; slightly smaller cells are cut elsewhere, often with larger angles.
     """
@@ -162,7 +162,7 @@ def well_shaped(make: Callable[[float], PatientMesh], cells: Cells) -> PatientMe
 def region_volumes(
     mesh: TetMesh, names: Sequence[str], whole: float, sources: dict[int, float]
 ) -> tuple[RegionVolume, ...]:
-    """Volumes of the whole organ and of the regions after the first; `sources` holds theirs by tag [m^3]."""
+    """Volumes of the whole organ and of the regions after the first, by theirs in the source by tag [m^3]."""
     volumes = [RegionVolume(names[0], whole, float(mesh.volumes.sum()))]
     for tag, name in enumerate(names[1:], start=2):
         volumes.append(RegionVolume(name, sources[tag], float(mesh.volumes[mesh.region == tag].sum())))
@@ -175,7 +175,7 @@ def image_volume(image: LabelImage) -> float:
 
 
 def mesh_image(image: LabelImage, source: str, *, cells: Cells, mesher: str, mend: bool) -> PatientMesh:
-    """Mesh the largest part of an image's labels, in LPS."""
+    """Mesh of the largest part of an image's labels, in LPS."""
     return well_shaped(lambda size: _mesh_labels(image, source, cells, size, mesher, mend), cells)
 
 
@@ -209,7 +209,7 @@ def _mesh_labels(
 
 
 def image_surface(image: LabelImage, mesh: PatientMesh, *, mend: bool) -> SurfaceFit:
-    """The level set of an image's labels that has their volume, in LPS, fitted to the mesh made of them."""
+    """Level set of an image's labels with their volume, in LPS, fitted to the mesh made of them."""
     labels = clean_labels(image, cell_size=mesh.cell_size, mend=mend)
     area = surface_area(mesh.mesh.points, mesh.mesh.boundary_triangles)
     vertices, triangles = level_surface(_smoothed(labels, 1, mesh.cell_size), mesh.volumes[0].source, area)
@@ -221,7 +221,7 @@ def image_surface(image: LabelImage, mesh: PatientMesh, *, mend: bool) -> Surfac
 
 
 def _fine_face(cells: Cells, axes: FloatArray) -> FineFace | None:
-    """The face at which cells are fine, in an image whose axes are the columns of (3, 3); None for one size."""
+    """Face of fine cells in an image with axes as columns of (3, 3); None for cells of one size."""
     if cells.coarsening == 1:
         return None
     x, y, z = matmul(np.asarray(cells.approach), axes).tolist()
@@ -236,7 +236,7 @@ class PatientSurfaces:
         organ: closed, or broken and to be mended
         inner: of the regions, in their order
         sources: names of the files
-        notes: remarks on what was dropped
+        notes: remarks on dropped parts
     """
 
     organ: ClosedSurface | BrokenSurface
@@ -246,23 +246,23 @@ class PatientSurfaces:
 
     @property
     def volume(self) -> float:
-        """Volume that the organ's surface encloses [m^3]."""
+        """Volume inside the organ's surface [m^3]."""
         return abs(surface_volume(self.organ.vertices, self.organ.triangles))
 
 
 def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool) -> PatientSurfaces:
-    """Read closed surfaces, in the files' own axes.
+    """Closed surfaces of files, in their own axes.
 
     Args:
         files: the organ's surface, then those of regions, named after their files.
         length_unit: of all files.
-        mend: whether an organ's surface that is open or crosses itself may be rebuilt from voxels.
+        mend: rebuild an organ's surface that is open or crosses itself from voxels.
     """
     organ, dropped = read_organ_surface(files[0], length_unit, mend=mend)
     inner = []
     for file in files[1:]:
         inner += read_region_surfaces(file, length_unit, region_name(file))
-    names = [organ.name, *(one.name for one in inner)]
+    names = [organ.name, *(surface.name for surface in inner)]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise MeshError(f"region {twice!r} is given twice; give the files other names")
@@ -270,7 +270,7 @@ def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool)
 
 
 def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
-    """Mesh closed surfaces, in the files' own axes.
+    """Mesh of closed surfaces, in the files' own axes.
 
     Args:
         given: the surfaces.
@@ -278,7 +278,7 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
         mesher: "lattice" or "tetwild".
     """
     organ, inner = given.organ, given.inner
-    names = [organ.name, *(one.name for one in inner)]
+    names = [organ.name, *(surface.name for surface in inner)]
     graded: dict[str, Any] = {}
     if cells.coarsening > 1 and isinstance(organ, ClosedSurface):
         facing = outward_facing(organ.vertices, organ.triangles, cells.approach, cells.face_angle_deg)
@@ -295,7 +295,7 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
             plain = TetMesh(filled.mesh.points + start, filled.mesh.tets)
             volume = filled.label_volume
         elif mesher == "tetwild":
-            plain, volume = tetwild_mesh([organ, *inner], cell_size), organ.volume
+            plain, volume = _tetwild_mesh([organ, *inner], cell_size), organ.volume
         else:
             coarse = cells.coarsening * cell_size if graded else None
             plain = mesh_surface(
@@ -320,7 +320,7 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
 
 
 def file_surface(given: PatientSurfaces, mesh: PatientMesh) -> SurfaceFit:
-    """An organ's surface as its file has it, or rebuilt from voxels where it is broken, fitted to its mesh."""
+    """Surface of an organ's file, or rebuilt from voxels if it is broken, fitted to its mesh."""
     organ = given.organ
     if isinstance(organ, ClosedSurface):
         return fitted_surface(organ.vertices, organ.triangles, mesh.mesh, mesh.cell_size)
@@ -337,17 +337,18 @@ def _with_regions(
 ) -> tuple[TetMesh, dict[int, float]]:
     """The mesh with tags from 2 on for the surfaces inside it, and the volume to be tagged for each [m^3]."""
     shares = [
-        RegionShare(tag, one.name, *_share_inside(mesh, one, cell_size)) for tag, one in enumerate(inner, start=2)
+        RegionShare(tag, surface.name, *_share_inside(mesh, surface, cell_size))
+        for tag, surface in enumerate(inner, start=2)
     ]
     tags = tag_tets(mesh, 1, shares)
-    names = [(1, name), *((one.tag, one.name) for one in shares)]
-    return TetMesh(mesh.points, mesh.tets, tags, tuple(names)), {one.tag: one.volume for one in shares}
+    names = [(1, name), *((share.tag, share.name) for share in shares)]
+    return TetMesh(mesh.points, mesh.tets, tags, tuple(names)), {share.tag: share.volume for share in shares}
 
 
 def _share_inside(mesh: TetMesh, surface: ClosedSurface, cell_size: float) -> tuple[FloatArray, float]:
     """Share of each tet inside a surface (n_tet,), and the total volume inside it [m^3]."""
     extent = np.ptp(surface.vertices, axis=0)
-    # Fine enough also for a region that is small against a cell.
+    # Fine enough for a region smaller than a cell, too.
     step = min(cell_size, float(extent.min())) / CELL_VOXELS
     inside, first = voxels_inside(surface.vertices, surface.triangles, step)
     share = label_share(mesh, inside, first, np.full(3, step))
@@ -360,8 +361,8 @@ def _share_inside(mesh: TetMesh, surface: ClosedSurface, cell_size: float) -> tu
     return share, min(volume, surface.volume)
 
 
-def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh:
-    """Tets inside the first surface, which encloses the others; these are regions, tagged from 2 in their order.
+def _tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh:
+    """Tets inside the first surface; the others, inside it, are regions, tagged from 2 in their order.
 
     fTetWild is not deterministic: the same surfaces give a different mesh each time.
 
@@ -372,9 +373,9 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
         import pytetwild  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MeshError(f"--mesher tetwild needs pytetwild ({error}): pip install 'surgsim[tetwild]'") from None
-    starts = np.cumsum([0, *(len(one.vertices) for one in surfaces)])
-    vertices = np.concatenate([one.vertices for one in surfaces])
-    triangles = np.concatenate([one.triangles + start for one, start in zip(surfaces, starts, strict=False)])
+    starts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+    vertices = np.concatenate([surface.vertices for surface in surfaces])
+    triangles = np.concatenate([surface.triangles + start for surface, start in zip(surfaces, starts, strict=False)])
     diagonal = float(norm(np.ptp(vertices, axis=0)))
     share = EDGE_PER_CELL * cell_size / diagonal
     # fTetWild leaves a file, __tracked_surface.stl, in the current folder.
@@ -388,13 +389,14 @@ def tetwild_mesh(surfaces: Sequence[ClosedSurface], cell_size: float) -> TetMesh
     body = largest_body_mesh(nodes, tets, f"a cell_size below {cell_size:g} m")
     tags = np.ones(body.tet_count, dtype=np.int32)
     middles = body.points[body.tets].mean(axis=1)
-    for tag, one in enumerate(surfaces[1:], start=2):
-        step = float(np.ptp(one.vertices, axis=0).max()) / REGION_VOXELS
-        inside, first = voxels_inside(one.vertices, one.triangles, step)
+    for tag, surface in enumerate(surfaces[1:], start=2):
+        step = float(np.ptp(surface.vertices, axis=0).max()) / REGION_VOXELS
+        inside, first = voxels_inside(surface.vertices, surface.triangles, step)
         tags[voxels_at(middles, inside, first, np.full(3, step))] = tag
         if not (tags == tag).any():
-            raise MeshError(f"region {one.name!r} holds no tet: use smaller cells, or leave it out")
-    return TetMesh(body.points, body.tets, tags, tuple((n, one.name) for n, one in enumerate(surfaces, start=1)))
+            raise MeshError(f"region {surface.name!r} holds no tet: use smaller cells, or leave it out")
+    names = tuple((tag, surface.name) for tag, surface in enumerate(surfaces, start=1))
+    return TetMesh(body.points, body.tets, tags, names)
 
 
 def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[int, float]]:
@@ -406,7 +408,7 @@ def _conforming(labels: CleanLabels, cell_size: float) -> tuple[TetMesh, dict[in
     for tag in tags[1:]:
         surface = _level_surface(_smoothed(labels, tag, cell_size), volumes[tag])
         surfaces.append(ClosedSurface(labels.names[tag - 1], *surface))
-    return tetwild_mesh(surfaces, cell_size), volumes
+    return _tetwild_mesh(surfaces, cell_size), volumes
 
 
 def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:
@@ -416,7 +418,7 @@ def _smoothed(labels: CleanLabels, tag: int, cell_size: float) -> SmoothedShare:
 
 
 def _level_surface(field: SmoothedShare, volume: float) -> tuple[FloatArray, NDArray[np.int64]]:
-    """The largest closed level set of a smoothed label, at the level that encloses a volume [m^3]."""
+    """Largest closed level set of a smoothed label that encloses a volume [m^3]."""
     try:
         from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
     except ImportError:

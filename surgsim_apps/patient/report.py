@@ -1,4 +1,4 @@
-"""report.html of a patient's organ: source, mesh, tissue, palpation, scene, and pictures drawn without OpenGL."""
+"""Report page of a patient's organ: source, mesh, tissue, palpation, scene, and pictures drawn without OpenGL."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality
 from msdm_core.organ import compile_organ, stable_dt
 from surgsim_apps.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_apps.patient.patient_scene import PatientScene
-from surgsim_apps.patient.retract_scene import RetractScene, told
+from surgsim_apps.patient.retract_scene import RetractScene, retraction_text
 from surgsim_apps.patient.supports import held_text
 from surgsim_apps.reports.html_page import Picture, render_page
 from surgsim_apps.reports.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
 from surgsim_env.rendering import cut_edges
-from surgsim_env.scene import hertz_force, hidden_text, share_text
+from surgsim_env.scene import hertz_force, hidden_share, share_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-GENERATOR = "surgsim organ"
 VOLUME_ERROR_LARGEST = 0.02
 
 # Cells of a table, the first of which names the row.
@@ -44,16 +43,16 @@ SIDES = (
 
 
 def report_page(
-    found: PatientScene, scene_text: str, scene_file: str, command: str, retraction: RetractScene | str | None = None
+    organ: PatientScene, scene_text: str, scene_file: str, command: str, retraction: RetractScene | str | None = None
 ) -> str:
-    """The page's text.
+    """Text of the page.
 
     Args:
-        found: the organ with its scene.
-        scene_text: the scene as it is written.
-        scene_file: its file's name.
-        command: the command that makes this report.
-        retraction: its scene, or the reason why there is none; None where it was not looked for.
+        organ: the organ with its scene.
+        scene_text: text of the scene file.
+        scene_file: its name.
+        command: command line of this report.
+        retraction: its scene, or the reason for none; None without a search.
     """
     outside = (
         "Top: the whole organ; bottom: cut open through the middle of its largest region, without the part nearer to "
@@ -61,45 +60,45 @@ def report_page(
     )
     return render_page(
         "organ.html.j2",
-        generator=GENERATOR,
-        title=f"Organ: {found.scene.description}",
-        verdict=verdict(found),
-        notes=[*found.patient.notes, *found.notes],
-        source=_source(found),
-        volumes=_volumes(found),
-        organ_picture=Picture("From three sides", outside, organ_picture(found)),
-        mesh=_mesh(found),
-        regions=_regions(found),
-        step=_step(found),
-        palpation=_palpation(found),
-        retraction=None if retraction is None else told(retraction),
+        generator="surgsim organ",
+        title=f"Organ: {organ.scene.description}",
+        verdict=verdict(organ),
+        notes=[*organ.patient.notes, *organ.notes],
+        source=_source(organ),
+        volumes=_volumes(organ),
+        organ_picture=Picture("From three sides", outside, organ_picture(organ)),
+        mesh=_mesh(organ),
+        regions=_regions(organ),
+        step=_step(organ),
+        palpation=_palpation(organ),
+        retraction=None if retraction is None else retraction_text(retraction),
         scene_text=scene_text,
         scene_file=scene_file,
         command=command,
     )
 
 
-def verdict(found: PatientScene) -> str:
-    """The most important results in a sentence or two."""
-    patient, quality = found.patient, mesh_quality(found.patient.mesh)
+def verdict(organ: PatientScene) -> str:
+    """Main results in a sentence or two."""
+    patient, quality = organ.patient, mesh_quality(organ.patient.mesh)
     fits = abs(patient.volume_error) <= VOLUME_ERROR_LARGEST
     shaped = quality.dihedral_smallest_deg >= DIHEDRAL_SMALLEST
-    said = (
+    text = (
         f"The mesh has {quality.tet_count} tets and {quality.volume * 1e6:.1f} ml, "
         f"{patient.volume_error:+.2%} against the file"
         f"{'' if fits else ' (more than 2 %: use smaller cells)'}; the smallest dihedral angle is "
         f"{quality.dihedral_smallest_deg:.1f} degrees{'' if shaped else ' (below 10: it makes the step short)'}."
     )
     count = len(patient.lesions)
-    said += (
+    text += (
         f" {count} segmented lesion{'s are' if count != 1 else ' is'} in it." if count else " No lesion was segmented."
     )
-    remarks = len(patient.notes) + len(found.notes)
-    return said + (f" {remarks} remark{'s' if remarks != 1 else ''} below." if remarks else "")
+    remarks = len(patient.notes) + len(organ.notes)
+    return text + (f" {remarks} remark{'s' if remarks != 1 else ''} below." if remarks else "")
 
 
-def _source(found: PatientScene) -> Rows:
-    patient = found.patient
+def _source(organ: PatientScene) -> Rows:
+    patient = organ.patient
     return [
         ("files", ", ".join(patient.sources)),
         ("axes", patient.convention),
@@ -107,16 +106,16 @@ def _source(found: PatientScene) -> Rows:
     ]
 
 
-def _volumes(found: PatientScene) -> Rows:
-    names = [f"{found.patient.organ_name} (whole)", *(one.name for one in found.patient.volumes[1:])]
+def _volumes(organ: PatientScene) -> Rows:
+    names = [f"{organ.patient.organ_name} (whole)", *(volume.name for volume in organ.patient.volumes[1:])]
     return [
-        (name, f"{one.source * 1e6:.2f} ml", f"{one.mesh * 1e6:.2f} ml", f"{one.error:+.2%}")
-        for name, one in zip(names, found.patient.volumes, strict=True)
+        (name, f"{volume.source * 1e6:.2f} ml", f"{volume.mesh * 1e6:.2f} ml", f"{volume.error:+.2%}")
+        for name, volume in zip(names, organ.patient.volumes, strict=True)
     ]
 
 
-def _mesh(found: PatientScene) -> Rows:
-    mesh = found.patient.mesh
+def _mesh(organ: PatientScene) -> Rows:
+    mesh = organ.patient.mesh
     quality = mesh_quality(mesh)
     x, y, z = np.ptp(mesh.points, axis=0) * 1e3
     low = " ".join(f"{value * 1e3:.1f}" for value in mesh.points.min(axis=0))
@@ -128,74 +127,83 @@ def _mesh(found: PatientScene) -> Rows:
     ]
 
 
-def _regions(found: PatientScene) -> Rows:
-    mesh, rows = found.patient.mesh, Rows()
+def _regions(organ: PatientScene) -> Rows:
+    mesh, rows = organ.patient.mesh, Rows()
     for tag, name in mesh.region_names:
-        what, volume = found.organ if tag == 1 else found.regions[name], float(mesh.volumes[mesh.region == tag].sum())
-        modulus, ratio = f"{what.material.youngs_modulus:g} Pa", f"{what.material.poisson_ratio:g}"
-        mass = f"{volume * what.material.density:.4f} kg"
-        rows.append((name, f"{volume * 1e6:.2f} ml", mass, modulus, ratio, what.source))
+        tissue, volume = organ.tissue if tag == 1 else organ.regions[name], mesh.volumes[mesh.region == tag].sum()
+        modulus, ratio = f"{tissue.material.youngs_modulus:g} Pa", f"{tissue.material.poisson_ratio:g}"
+        mass = f"{volume * tissue.material.density:.4f} kg"
+        rows.append((name, f"{volume * 1e6:.2f} ml", mass, modulus, ratio, tissue.source))
     return rows
 
 
-def _step(found: PatientScene) -> Rows:
-    anatomy, scene = found.anatomy, found.scene
-    organ = compile_organ(anatomy.specification(anatomy.demonstration_lesions()))
-    capsule, in_contact = scene.capsule, stable_dt(organ, scene.contact.law)
+def _step(organ: PatientScene) -> Rows:
+    anatomy, scene = organ.anatomy, organ.scene
+    model = compile_organ(anatomy.specification(anatomy.demonstration_lesions()))
+    capsule, in_contact = scene.capsule, stable_dt(model, scene.contact.law)
     shell = "none" if capsule is None else f"{capsule.youngs_modulus:g} Pa, {capsule.thickness or 0.0:g} m"
     return [
-        ("total mass", f"{organ.node_mass.sum():.4f} kg"),
-        ("springs", f"{len(organ.spring_nodes)}"),
-        ("held by", "; ".join(held_text(one) for one in scene.anchors)),
+        ("total mass", f"{model.node_mass.sum():.4f} kg"),
+        ("springs", f"{len(model.spring_nodes)}"),
+        ("held by", "; ".join(held_text(anchor) for anchor in scene.anchors)),
         ("fixed and elastically held nodes", f"{len(anatomy.anchors)} and {len(anatomy.foundation_nodes)}"),
-        ("capsule", f"{shell}, over {len(organ.surface_triangles)} free boundary triangles"),
-        ("stable step", f"{organ.stable_step * 1e3:.3f} ms, in contact {in_contact * 1e3:.3f} ms"),
+        ("capsule", f"{shell}, over {len(model.surface_triangles)} free boundary triangles"),
+        ("stable step", f"{model.stable_step * 1e3:.3f} ms, in contact {in_contact * 1e3:.3f} ms"),
         ("substeps in a haptic step of 1 ms", f"{scene.timing.substep_count}"),
     ]
 
 
-def _palpation(found: PatientScene) -> Rows:
-    scene, palpation = found.scene, found.scene.palpation
+def _palpation(organ: PatientScene) -> Rows:
+    scene, palpation = organ.scene, organ.scene.palpation
     tip, depth = scene.instrument.tip_radius, palpation.press_depth
     x, y, z = scene.instrument.approach
     return [
         ("tip and press", f"ball of {tip * 1e3:g} mm radius, {depth * 1e3:g} mm deep"),
         ("approach", f"{x:g}, {y:g}, {z:g}"),
-        ("sites", f"{found.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
-        ("cell / contact radius", share_text(found.anatomy.palpable_cell, tip, depth)),
+        ("sites", f"{organ.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
+        ("cell / contact radius", share_text(organ.anatomy.palpable_cell, tip, depth)),
         ("contact", hidden_text(2.0 * hertz_force(scene.material, tip, depth), tip, depth, scene.contact.stiffness)),
-        ("held", "not checked" if found.hold is None else found.hold.text),
+        ("held", "not checked" if organ.hold is None else organ.hold.text),
         ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
     ]
 
 
-def organ_picture(found: PatientScene) -> bytes:
-    """PNG of three views: above whole with the palpable face and the anchors, below cut open through a region."""
+def hidden_text(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> str:
+    """`hidden_share` in words."""
+    share = hidden_share(force, tip_radius, press_depth, contact_stiffness)
+    return (
+        f"contact hides about {share:.1%} of the contrast over 1 where a press feels {force:.2f} N: "
+        f"9 F / (4 pi k_p R d^2) with k_p {contact_stiffness:.3g} N/m^3"
+    )
+
+
+def organ_picture(organ: PatientScene) -> bytes:
+    """PNG of three views: at the top whole with palpable face and anchors, below cut open through a region."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.5, 8.6), dpi=100, facecolor=PAPER, layout="constrained")
     axes = figure.subplots(2, 3)
-    mesh = found.anatomy.mesh
-    patches = organ_patches(found.anatomy)
-    colours = _outer_colours(found)[patches.origin]
-    through = _through(found)
+    mesh = organ.anatomy.mesh
+    patches = organ_patches(organ.anatomy)
+    colours = _outer_colours(organ)[patches.origin]
+    through = _through(organ)
     for column, (along, up, of_scan, of_file) in enumerate(SIDES):
         view = OrthographicView.along(np.array(along), up=np.array(up))
         draw_patches(axes[0, column], [(patches, colours, 0.12)], view)
         _draw_cut(axes[1, column], mesh, patches, colours, through, view)
-        axes[0, column].set_title(of_scan if found.patient.is_scan else of_file, color=INK, fontsize=11)
+        axes[0, column].set_title(of_scan if organ.patient.is_scan else of_file, color=INK, fontsize=11)
         axes[1, column].set_title("cut open there", color=INK, fontsize=11)
-    for one in axes.flat:
-        one.set_aspect("equal")
-        one.set_axis_off()
+    for cell in axes.flat:
+        cell.set_aspect("equal")
+        cell.set_axis_off()
     _scale_bar(axes[0, 0], mesh)
-    _legend(figure, found)
+    _legend(figure, organ)
     return _png(figure)
 
 
-def _outer_colours(found: PatientScene) -> FloatArray:
+def _outer_colours(organ: PatientScene) -> FloatArray:
     """Colours of the boundary triangles (n_triangle, 3)."""
-    mesh, anatomy = found.anatomy.mesh, found.anatomy
+    mesh, anatomy = organ.anatomy.mesh, organ.anatomy
     triangles = mesh.boundary_triangles
     colours = np.broadcast_to(TISSUE, (len(triangles), 3)).copy()
     palpable = {tuple(row) for row in anatomy.face.triangles.tolist()}
@@ -212,20 +220,20 @@ def _region_colours(mesh: TetMesh) -> dict[int, FloatArray]:
     return {tag: REGIONS[number % len(REGIONS)] for number, (tag, _) in enumerate(mesh.region_names[1:])}
 
 
-def _through(found: PatientScene) -> FloatArray:
+def _through(organ: PatientScene) -> FloatArray:
     """A point on the cutting planes [m]: the centre of the largest region, lesions first, or of the organ."""
-    mesh = found.anatomy.mesh
-    inner = found.patient.volumes[1:]
+    mesh = organ.anatomy.mesh
+    inner = organ.patient.volumes[1:]
     if not inner:
         return matmul(mesh.volumes, mesh.points[mesh.tets].mean(axis=1)) / mesh.volumes.sum()
-    largest = max(inner, key=lambda one: (one.name in found.patient.lesions, one.mesh)).name
-    return lesion_extent(mesh, Lesion(region=largest, material=found.organ.material, name=largest))[0]
+    largest = max(inner, key=lambda volume: (volume.name in organ.patient.lesions, volume.mesh)).name
+    return lesion_extent(mesh, Lesion(region=largest, material=organ.tissue.material, name=largest))[0]
 
 
 def _draw_cut(
     axes: Axes, mesh: TetMesh, patches: Patches, colours: FloatArray, through: FloatArray, view: OrthographicView
 ) -> None:
-    """Draw the part behind the plane through a point that faces the viewer, and the section in its regions' colours."""
+    """Draw the part behind the plane through a point across the view, and the section in its regions' colours."""
     from matplotlib.collections import PolyCollection
 
     behind = matmul(patches.corners.mean(axis=1) - through, view.towards) < 0.0
@@ -251,7 +259,7 @@ def section(mesh: TetMesh, through: FloatArray, normal: FloatArray) -> tuple[lis
         cut.append(tets)
     owner = np.concatenate(cut)
     order = np.argsort(owner)
-    return [polygons[one] for one in order], mesh.region[owner[order]]
+    return [polygons[index] for index in order], mesh.region[owner[order]]
 
 
 def _scale_bar(axes: Axes, mesh: TetMesh) -> None:
@@ -261,12 +269,12 @@ def _scale_bar(axes: Axes, mesh: TetMesh) -> None:
     axes.annotate(f"{length:g} mm", (low, bottom), (0, 4), textcoords="offset points", color=INK, fontsize=9)
 
 
-def _legend(figure: Figure, found: PatientScene) -> None:
+def _legend(figure: Figure, organ: PatientScene) -> None:
     from matplotlib.patches import Patch
 
-    mesh = found.anatomy.mesh
+    mesh = organ.anatomy.mesh
     names = dict(mesh.region_names)
-    entries = [(PALPABLE, "palpable face"), (HELD, "held"), (SECTION, f"{found.patient.organ_name}, cut")]
+    entries = [(PALPABLE, "palpable face"), (HELD, "held"), (SECTION, f"{organ.patient.organ_name}, cut")]
     entries += [(colour, names[tag]) for tag, colour in _region_colours(mesh).items()]
     figure.legend(
         handles=[Patch(color=tuple(colour), label=name) for colour, name in entries[:10]],

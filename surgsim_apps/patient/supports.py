@@ -1,4 +1,4 @@
-"""What holds a patient's organ: fat and wall on the side away from the probe, and attachments by the organ's name."""
+"""Supports of a patient's organ: fat on the side away from the probe, attachments by the organ's name."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,8 +7,19 @@ import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh import FloatArray, TetMesh
-from surgsim_apps.palpate.scene_options import FAT_NAME, FAT_SOURCE, soft_bed
-from surgsim_env.scene import Anchor, Ball, Vector
+from surgsim_env.scene import Anchor, Ball, Side, Vector
+
+# Fat around an organ but for the side of the probe: E / h and E / 3h of 8 mm of it (chosen).
+# E is 3 x 752 Pa, by the shear modulus of unloaded human fat in MR elastography at 50 Hz (gluteal, J Mech Behav Biomed
+# Mater 2023, "Strain-dependent shear properties of human adipose tissue in vivo"); in pigs 3 x 530 Pa (doi
+# 10.1007/s10237-010-0207-9).
+FAT_STIFFNESS, FAT_SHEAR_STIFFNESS = 2.8e5, 9.4e4
+# It reaches around the flanks: largest angle between outward normal and approach [degrees].
+FAT_ANGLE = 110.0
+FAT_SOURCE = (
+    "[N/m^3] E / h, and E / 3h across, of a layer of fat, h 8 mm (chosen), E 3 x 752 Pa (human, MR elastography 2023)"
+)
+FAT_NAME = "surrounding fat and wall"
 
 # Stiffness of ligaments and of a hilum, per area [N/m^3]: chosen, four times that of fat: 1 mm under 1 kPa.
 LIGAMENT_STIFFNESS, LIGAMENT_SHEAR_STIFFNESS = 1.0e6, 3.3e5
@@ -18,12 +29,12 @@ PLACE_DIGITS = 4
 
 @dataclass(frozen=True)
 class Attachment:
-    """A place where anatomy attaches an organ.
+    """Anatomical attachment of an organ.
 
     Args:
         name: of the tissue.
         direction: from the organ's middle in the axes of a scan: x to the patient's left, y to the back, z to the head.
-        radius: of the ball around the surface point there, over the organ's largest extent.
+        radius: of a ball around the surface point there, over the organ's largest extent.
     """
 
     name: str
@@ -43,39 +54,41 @@ ATTACHMENTS: Mapping[str, tuple[Attachment, ...]] = {
 }
 
 
+def soft_bed(approach: Vector, name: str = FAT_NAME) -> Anchor:
+    """Fat over the side away from the probe and the flanks."""
+    return Anchor(name, side=Side(approach, FAT_ANGLE), stiffness=FAT_STIFFNESS, shear_stiffness=FAT_SHEAR_STIFFNESS)
+
+
 def organ_anchors(
     organ_name: str, mesh: TetMesh, approach: Vector, *, is_scan: bool
 ) -> tuple[tuple[Anchor, ...], dict[str, str]]:
-    """The anchors of a patient's organ, and where their numbers come from by the path of their entry in a scene.
+    """Anchors of a patient's organ, and the sources of their numbers by the path of their entry in a scene.
 
-    Attachments need the axes of a scan: in a surface's axes nobody knows where
-    the back is, and only the fat holds it.
+    Attachments need the axes of a scan: the axes of a surface do not tell the back, and fat alone holds it.
 
     Args:
         organ_name: such as "left kidney".
         mesh: of the organ.
         approach: of the probe, of length 1.
-        is_scan: whether the axes are those of a scan.
+        is_scan: true for the axes of a scan.
     """
-    word = next((one for one in ATTACHMENTS if one in organ_name.lower()), "")
+    word = next((name for name in ATTACHMENTS if name in organ_name.lower()), "")
     anchors = [soft_bed(approach, FAT_NAMES.get(word, FAT_NAME))]
     sources = {"anchors[0].stiffness": FAT_SOURCE, "anchors[0].side": "away from the probe"}
-    for one in ATTACHMENTS.get(word, ()) if is_scan else ():
-        direction = np.array(one.direction)
+    for attachment in ATTACHMENTS.get(word, ()) if is_scan else ():
+        direction = np.array(attachment.direction)
         if word == "kidney" and "right" in organ_name.lower():
             direction[0] *= -1.0
         x, y, z = np.round(_surface_point(mesh, direction), PLACE_DIGITS).tolist()
-        radius = round(one.radius * float(np.ptp(mesh.points, axis=0).max()), PLACE_DIGITS)
+        radius = round(attachment.radius * float(np.ptp(mesh.points, axis=0).max()), PLACE_DIGITS)
         sources[f"anchors[{len(anchors)}].stiffness"] = LIGAMENT_SOURCE
-        ball = Ball((x, y, z), radius)
-        anchors.append(
-            Anchor(one.name, ball=ball, stiffness=LIGAMENT_STIFFNESS, shear_stiffness=LIGAMENT_SHEAR_STIFFNESS)
-        )
+        place, along, across = Ball((x, y, z), radius), LIGAMENT_STIFFNESS, LIGAMENT_SHEAR_STIFFNESS
+        anchors.append(Anchor(attachment.name, ball=place, stiffness=along, shear_stiffness=across))
     return tuple(anchors), sources
 
 
 def _surface_point(mesh: TetMesh, direction: FloatArray) -> FloatArray:
-    """The surface node that lies best in a direction from the organ's centroid [m], (3,)."""
+    """Surface node [m] (3,) nearest in angle to a direction from the organ's centroid."""
     centre = matmul(mesh.volumes, mesh.points[mesh.tets].mean(axis=1)) / mesh.volumes.sum()
     surface = mesh.points[mesh.boundary_nodes]
     away = surface - centre

@@ -1,5 +1,6 @@
-"""Surfaces of an organ and its regions from STL, OBJ and PLY files, one file for each, and the voxels inside them."""
+"""Surfaces of an organ and its regions from STL, OBJ and PLY files, and the voxels inside them."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ SHIFT = 1e-6 * np.array([np.sqrt(2) - 1, np.sqrt(3) - 1, np.sqrt(5) - 2])
 
 @dataclass(frozen=True, eq=False)
 class ClosedSurface:
-    """A closed surface: vertices [m] (n_vertex, 3), outward triangles (n_triangle, 3), and its region's name."""
+    """Closed surface: vertices [m] (n_vertex, 3), outward triangles (n_triangle, 3), and its region's name."""
 
     name: str
     vertices: FloatArray
@@ -31,13 +32,13 @@ class ClosedSurface:
 
     @property
     def volume(self) -> float:
-        """[m^3]."""
+        """Enclosed volume [m^3]."""
         return surface_volume(self.vertices, self.triangles)
 
 
 @dataclass(frozen=True, eq=False)
 class BrokenSurface:
-    """A surface that encloses no body unless it is rebuilt (`--mend`): vertices [m], triangles and its fault."""
+    """Surface without a body until it is rebuilt (`--mend`): vertices [m], triangles and its fault."""
 
     name: str
     vertices: FloatArray
@@ -46,15 +47,15 @@ class BrokenSurface:
 
 
 def region_name(file: Path) -> str:
-    """A region's name: the stem of its file, with underscores for characters that no name may have."""
-    kept = "".join(one if one.isascii() and (one.isalnum() or one in "_ .-") else "_" for one in file.stem)[:40]
+    """Name of a region: the stem of its file, with underscores for characters outside names."""
+    kept = re.sub(r"[^A-Za-z0-9_ .-]", "_", file.stem)[:40]
     return check_name(kept.strip(" .-") or "organ", str(file))
 
 
 def read_organ_surface(
     file: Path, length_unit: LengthUnit, *, mend: bool
 ) -> tuple[ClosedSurface | BrokenSurface, list[str]]:
-    """The largest body of a surface file, and notes on what was dropped.
+    """Largest body of a surface file, and notes on dropped ones.
 
     Raises:
         MeshError: a surface that is open, crosses itself or is no manifold, unless `mend` is set.
@@ -65,7 +66,7 @@ def read_organ_surface(
     bodies, name = bodies_of(vertices, triangles.astype(np.int64)), region_name(file)
     notes = []
     if len(bodies) > 1 and not mend:
-        volumes = ", ".join(f"{abs(surface_volume(*one)) * 1e6:.3g}" for one in bodies[1:6])
+        volumes = ", ".join(f"{abs(surface_volume(*body)) * 1e6:.3g}" for body in bodies[1:6])
         notes.append(
             f"{file.name}: {len(bodies) - 1} surface(s) apart from the largest were left out ({volumes}"
             f"{', ...' if len(bodies) > 6 else ''} ml)"
@@ -75,12 +76,11 @@ def read_organ_surface(
     except MeshError as error:
         if not mend:
             raise MeshError(f"{file}: {error}; or --mend rebuilds it from voxels") from None
-        every = merge_vertices(vertices, triangles)
-        return BrokenSurface(name, *every, fault=str(error)), notes
+        return BrokenSurface(name, *merge_vertices(vertices, triangles), fault=str(error)), notes
 
 
 def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list[ClosedSurface]:
-    """The closed surfaces of a region, largest first; those of a lesion are numbered where there are several.
+    """Closed surfaces of a region, largest first; several of a lesion are numbered.
 
     Raises:
         MeshError: a surface that is not closed, or several bodies of a region that is no lesion.
@@ -102,7 +102,7 @@ def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list
 
 
 def mended_voxels(surface: BrokenSurface, cell_size: float) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, str]:
-    """Rebuild a broken surface from voxels.
+    """Broken surface rebuilt from voxels.
 
     Returns:
         Voxels, 1 inside and 0 outside (n_x, n_y, n_z); their spacing (3,) [m]; the first centre (3,) [m]; a note.
@@ -124,28 +124,28 @@ def mended_voxels(surface: BrokenSurface, cell_size: float) -> tuple[NDArray[np.
 
 
 def bodies_of(vertices: FloatArray, triangles: Triangles) -> list[tuple[FloatArray, Triangles]]:
-    """The connected parts of a surface, by falling volume."""
+    """Connected parts of a surface, largest first."""
     edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
     count, part = connected_components(graph, directed=False)
     if count == 1:
         return [(vertices, triangles)]
     owner = part[triangles[:, 0]]
-    bodies = [merge_vertices(vertices, triangles[owner == one]) for one in np.unique(owner)]
+    bodies = [merge_vertices(vertices, triangles[owner == body]) for body in np.unique(owner)]
     return sorted(bodies, key=lambda body: -abs(surface_volume(*body)))
 
 
 def voxels_inside(
     vertices: FloatArray, triangles: NDArray[np.int64], step: float, *, vote: bool = False
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Voxels whose centres lie inside (n_x, n_y, n_z), and the grid index of the first (3,); centres are index * step.
+    """Voxels with centres inside (n_x, n_y, n_z), and the grid index of the first (3,); centres are index * step.
 
     Args:
         vertices: [m], shape (n_vertex, 3).
         triangles: shape (n_triangle, 3).
         step: edge of the voxels [m].
         vote: for surfaces with holes or self-intersections: majority of the lines along x, y and z through a voxel,
-            counting those that leave the body as often as they enter it. Otherwise lines along x alone decide.
+            counting lines with as many exits as entries. Otherwise lines along x alone decide.
     """
     first = np.floor(vertices.min(axis=0) / step).astype(np.int64) - 1
     shape = np.ceil(vertices.max(axis=0) / step).astype(np.int64) + 2 - first
@@ -164,7 +164,7 @@ def voxels_inside(
 def _winding(
     places: FloatArray, triangles: NDArray[np.int64], axis: int, shape: NDArray[np.int64]
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
-    """Entries minus exits of lines along an axis up to each voxel; whether each line ends outside (broadcastable)."""
+    """Entries minus exits of lines along an axis up to each voxel; true for lines that end outside (broadcastable)."""
     u, v = (axis + 1) % 3, (axis + 2) % 3
     a, b, c = (places[corner] for corner in triangles.T)
     leaving = np.cross(b - a, c - a)[:, axis] > 0

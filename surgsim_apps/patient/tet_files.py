@@ -1,4 +1,4 @@
-"""A patient's organ from a file of tets: its own tets as they are, or its surfaces, to be filled anew."""
+"""Patient's organ from a file of tets: the tets as they are, or their surfaces, to be filled anew."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from surgsim_env.scene import Vector
 
 @dataclass(frozen=True, eq=False)
 class PatientTets:
-    """Tets of an organ whose regions are named.
+    """Tets of an organ with named regions.
 
     Fields:
         mesh: tags from 1 on, the organ's own first, all of them named; in metres
@@ -49,7 +49,7 @@ class PatientTets:
         return float(self.mesh.volumes.sum())
 
     def face_cell(self, approach: Vector, face_angle_deg: float) -> float:
-        """Edge of the cubic cells that would have tets as large as those at the face towards a direction [m]."""
+        """Edge of cubic cells with tets as large as at the face towards a direction [m]."""
         triangles = self.mesh.boundary_triangles
         facing = outward_facing(self.mesh.points, triangles, approach, face_angle_deg)
         if not facing.any():
@@ -58,13 +58,13 @@ class PatientTets:
 
 
 def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[LabelName]) -> PatientTets:
-    """The tets of a file, with names for their regions.
+    """Tets of a file, with names for their regions.
 
     Args:
         file: vtu, vtk, msh or mesh.
         length_unit: may be left out for files that state it.
-        labels: names of the tags, the organ's first; empty for files that name their regions, of which the largest is
-            then the organ, or that have one region, which is named after the file.
+        labels: names of the tags, the organ's first. Without them the file's names are taken, the largest region being
+            the organ; a single region is named after the file.
 
     Raises:
         MeshError: a file that is no organ, tags without names, names without tets.
@@ -72,22 +72,22 @@ def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[Label
     from msdm_core.mesh_files import read_mesh
 
     mesh = read_mesh(file, length_unit=length_unit)
-    there = np.unique(mesh.region).tolist()
-    named = dict(mesh.region_names) if not labels else {one.value: one.name for one in labels}
-    if len(there) == 1 and not labels:
-        named = {there[0]: named.get(there[0], region_name(file))}
-    nameless = [tag for tag in there if tag not in named]
+    present = np.unique(mesh.region).tolist()
+    named = dict(mesh.region_names) if not labels else {label.value: label.name for label in labels}
+    if len(present) == 1 and not labels:
+        named = {present[0]: named.get(present[0], region_name(file))}
+    nameless = [tag for tag in present if tag not in named]
     if nameless:
         raise MeshError(
-            f"{file}: regions {', '.join(map(str, nameless))} of {', '.join(map(str, there))} have no name: "
+            f"{file}: regions {', '.join(map(str, nameless))} of {', '.join(map(str, present))} have no name: "
             "give --labels NAME=TAG,... with the organ first, such as liver=1,lesion=2"
         )
-    absent = [f"{name}={tag}" for tag, name in named.items() if tag not in there]
+    absent = [f"{name}={tag}" for tag, name in named.items() if tag not in present]
     if absent and labels:
         raise MeshError(
-            f"{file}: --labels {','.join(absent)}: no tet has this tag; those there are {', '.join(map(str, there))}"
+            f"{file}: --labels {','.join(absent)}: no tet has this tag; those there are {', '.join(map(str, present))}"
         )
-    order = [tag for tag in named if tag in there]
+    order = [tag for tag in named if tag in present]
     if not labels:
         order.sort(key=lambda tag: -float(mesh.volumes[mesh.region == tag].sum()))
     tags = np.zeros(mesh.tet_count, dtype=np.int32)
@@ -98,7 +98,7 @@ def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[Label
 
 
 def patient_of_tets(given: PatientTets, cell_size: float) -> PatientMesh:
-    """The organ with the tets of the file, whose cells at the pressed face are of a size [m]."""
+    """Organ with the tets of a file, with cells of a size at the pressed face [m]."""
     mesh, names = given.mesh, given.names
     volumes = {tag: float(mesh.volumes[mesh.region == tag].sum()) for tag, _ in mesh.region_names}
     return PatientMesh(
@@ -116,7 +116,7 @@ def patient_of_tets(given: PatientTets, cell_size: float) -> PatientMesh:
 
 
 def surfaces_of_tets(given: PatientTets) -> PatientSurfaces:
-    """The surfaces of the organ and of its regions, to be filled with tets anew.
+    """Surfaces of the organ and of its regions, to be filled with tets anew.
 
     Raises:
         MeshError: a region whose tets enclose no single body each, such as tets that share an edge alone.
@@ -127,20 +127,20 @@ def surfaces_of_tets(given: PatientTets) -> PatientSurfaces:
     for tag, name in mesh.region_names[1:]:
         bodies = bodies_of(mesh.points, _boundary(mesh.tets[mesh.region == tag]).astype(np.int64))
         for number, body in enumerate(bodies, start=1):
-            one = name if len(bodies) == 1 else f"{name} {number}"
-            inner.append(ClosedSurface(one, *_closed(*body, f"{given.source}: {one}")))
+            numbered = name if len(bodies) == 1 else f"{name} {number}"
+            inner.append(ClosedSurface(numbered, *_closed(*body, f"{given.source}: {numbered}")))
     return PatientSurfaces(organ, tuple(inner), (given.source,), ())
 
 
-def _closed(points: FloatArray, triangles: IntArray | Triangles, what: str) -> tuple[FloatArray, Triangles]:
+def _closed(points: FloatArray, triangles: IntArray | Triangles, name: str) -> tuple[FloatArray, Triangles]:
     try:
         return check_surface(*merge_vertices(points, triangles))
     except MeshError as error:
-        raise MeshError(f"{what}: {error}; leave --remesh out to keep its tets") from None
+        raise MeshError(f"{name}: {error}; leave --remesh out to keep its tets") from None
 
 
 def _boundary(tets: IntArray) -> IntArray:
-    """The outward triangles that belong to one of some tets alone, shape (n, 3)."""
+    """Outward triangles of single tets, shape (n, 3)."""
     faces = tets[:, TET_FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[count == 1]]

@@ -1,4 +1,4 @@
-"""Tip, press and cells of a patient's organ: a tip that passes a trocar, and cells that are not felt through it."""
+"""Tip, press and cells of a patient's organ."""
 
 import math
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from surgsim_env.scene import Vector, contact_radius
 TIPS = ((0.0005, 0.005), (math.inf, 0.006))
 # Press depth over tip radius, as in the scene liver.
 DEPTH_PER_TIP = 7.0 / 12.0
-# Edge of the lattice's cells over the contact radius sqrt(tip radius x press depth): at the palpable face of the organs
-# that were tried (a kidney, a liver, a stomach) edges are then 0.84 to 0.86 of it.
+# Edge of the lattice's cells over the contact radius sqrt(tip radius x press depth); at the palpable faces of a kidney,
+# a liver and a stomach edges are then 0.84 to 0.86 of it.
 CELL_PER_CONTACT_RADIUS = 0.9
-# A tip that is chosen for given cells: cells of one size are 0.85 of its contact radius.
+# Tip for given cells: cells of one size are 0.85 of its contact radius.
 TIP_STEP, TIP_RANGE, CELL_PER_TIP_CONTACT = 5e-4, (0.002, 0.015), 0.85
 DEPTH_STEP, CELL_STEP = 1e-4, 1e-5
-# Cells are fine under the pressed face to this depth in contact radii. On a kidney, presses then differ from those on
-# cells of one size by 1 to 2 %, without it by 2 to 14 %.
+# Depth of fine cells under the pressed face, in contact radii. On a kidney, presses then differ from those on cells of
+# one size by 1 to 2 %, without it by 2 to 14 %.
 FINE_DEPTH = 1.0
 # Largest cells elsewhere over the fine ones; at least CELLS_ACROSS of them fit along a cube of the organ's volume.
 COARSENINGS, CELLS_ACROSS = (4, 2, 1), 5.0
@@ -30,21 +30,21 @@ NODES_PER_CELL, FACE_NODES, FACE_SHARE, TETS_PER_NODE = 2.0, 11.5, 1.35, 4.9
 TIME_PER_TET = 9e-9
 # Substeps of an organ with a lesion 8 times as stiff in a haptic step of 1 ms, times cell over sqrt(E / density) [s].
 SUBSTEP_CELLS, HAPTIC_STEP = 10.0, 1e-3
-# The coarser choice that is offered has this many times the tip radius.
+# Tip radius of the coarser choice on offer, over that of the plan.
 COARSER = 1.5
 
 
 @dataclass(frozen=True)
 class TouchPlan:
-    """Tip, press and cells of an organ that is to be made.
+    """Tip, press and cells of an organ to be made.
 
     Fields:
         tip_radius, press_depth: [m]
         cell_size: of the lattice, of its fine cells where it is graded [m]
         coarsening: edge of the largest cells over that of the fine ones; 1 for cells of one size
         volume: of the organ [m^3]
-        is_given: whether the cell size is the user's
-        known_node_count: of tets that are there already
+        is_given: true for a cell size of the user
+        known_node_count: of the tets of a file
     """
 
     tip_radius: float
@@ -57,39 +57,38 @@ class TouchPlan:
 
     @property
     def fine_depth(self) -> float:
-        """Depth to which cells are fine under the pressed face [m]."""
+        """Depth of fine cells under the pressed face [m]."""
         return FINE_DEPTH * contact_radius(self.tip_radius, self.press_depth)
 
     @property
     def node_count(self) -> int:
-        """Number of nodes; for a mesh that is to be made an estimate, to two digits."""
+        """Number of nodes; before meshing an estimate, to two digits."""
         if self.known_node_count is not None:
             return self.known_node_count
         cell = self.coarsening * self.cell_size
         count = NODES_PER_CELL * self.volume / (cell * cell * cell)
         if self.coarsening > 1:
             count += FACE_NODES * FACE_SHARE * float(power(self.volume, 2.0 / 3.0)) / (self.cell_size * self.cell_size)
-        # A broken surface may enclose nothing, which its mesher finds.
+        # A broken surface may enclose nothing; its mesher refuses it.
         return max(int(float(f"{count:.2g}")), 1)
 
     def real_time_factor(self, material: Material) -> float:
-        """Estimate of simulated time over the processor time of one core, with the modulus and density of a tissue."""
+        """Estimate of simulated time over the processor time of one core, by the modulus and density of a tissue."""
         speed = math.sqrt(material.youngs_modulus / material.density)
         substeps = math.ceil(SUBSTEP_CELLS * HAPTIC_STEP * speed / self.cell_size)
         return HAPTIC_STEP / (TIME_PER_TET * TETS_PER_NODE * self.node_count * substeps)
 
 
 def plan_touch(volume: float, options: SceneOptions, *, cell_size: float | None, graded: bool) -> TouchPlan:
-    """The touch and cells of an organ of a volume [m^3].
+    """Touch and cells of an organ.
 
-    Without a cell size the tip passes a trocar and cells follow from it; with one the tip follows from the cells, which
-    are all of that size [m].
+    Without a cell size the tip passes a trocar and cells follow from it; with a cell size the tip follows from it.
 
     Args:
         volume: of the organ [m^3].
-        options: a tip radius or press depth that replaces the chosen one.
-        cell_size: [m], or None.
-        graded: whether the mesher can make coarser cells elsewhere.
+        options: tip radius and press depth, if given.
+        cell_size: of all cells [m], or None.
+        graded: true for a mesher of cells that are coarser elsewhere.
     """
     if cell_size is not None:
         tip = options.tip_radius or tip_for_cells(cell_size)
@@ -98,12 +97,12 @@ def plan_touch(volume: float, options: SceneOptions, *, cell_size: float | None,
     depth = options.press_depth or depth_for_tip(tip)
     cell = round(math.floor(CELL_PER_CONTACT_RADIUS * contact_radius(tip, depth) / CELL_STEP) * CELL_STEP, 7)
     across = float(cbrt(max(volume, 0.0))) / CELLS_ACROSS
-    coarsening = next((one for one in COARSENINGS if one * cell <= across), 1) if graded else 1
+    coarsening = next((factor for factor in COARSENINGS if factor * cell <= across), 1) if graded else 1
     return TouchPlan(tip, depth, cell, coarsening, volume, is_given=False)
 
 
 def tip_for_cells(cell_size: float) -> float:
-    """Radius of the smallest tip through which cells of a size are not felt, within TIP_RANGE [m]."""
+    """Radius of the smallest tip that does not feel cells of a size, within TIP_RANGE [m]."""
     wanted = math.ceil(cell_size / (CELL_PER_TIP_CONTACT * math.sqrt(DEPTH_PER_TIP)) / TIP_STEP) * TIP_STEP
     return min(max(round(wanted, 7), TIP_RANGE[0]), TIP_RANGE[1])
 
@@ -120,7 +119,7 @@ def plan_text(plan: TouchPlan, material: Material, approach: Vector) -> str:
     text = (
         f"tip {plan.tip_radius * 1e3:g} mm, pressed {plan.press_depth * 1e3:g} mm; cells of "
         f"{plan.cell_size * 1e3:.3g} mm{elsewhere if plan.coarsening > 1 else ''}: about {plan.node_count} nodes, "
-        f"{_times(plan.real_time_factor(material))} times real time on one core"
+        f"{plan.real_time_factor(material):.2g} times real time on one core"
     )
     if plan.is_given:
         return text
@@ -128,9 +127,5 @@ def plan_text(plan: TouchPlan, material: Material, approach: Vector) -> str:
     coarser = plan_touch(plan.volume, options, cell_size=None, graded=plan.coarsening > 1)
     return (
         f"{text}; coarser: --tip-radius {coarser.tip_radius:g}, about {coarser.node_count} nodes, "
-        f"{_times(coarser.real_time_factor(material))} times"
+        f"{coarser.real_time_factor(material):.2g} times"
     )
-
-
-def _times(factor: float) -> str:
-    return f"{factor:.2g}"

@@ -1,1 +1,1 @@
-"""Reports of the arm study and of a patient's organ as HTML pages."""
+"""Reports of applications: HTML pages, drawings of surfaces, folders of results."""

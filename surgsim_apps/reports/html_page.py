@@ -13,19 +13,19 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-# The browser itself refuses to load anything.
+# The browser refuses to load anything.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A PNG picture of a report.
+    """PNG picture of a report.
 
     Fields:
         title: heading of its caption
-        description: what it shows, in the caption and as the alternative text
-        png: the picture itself
-        name: of its file; "" where it has none
+        description: in the caption and as the alternative text
+        png: bytes of the file
+        name: of its file; "" for none
     """
 
     title: str
@@ -35,17 +35,17 @@ class Picture:
 
     @classmethod
     def of_file(cls, path: Path, title: str, description: str) -> "Picture":
-        """The picture that a PNG file holds."""
+        """Picture of a PNG file."""
         return cls(title, description, path.read_bytes(), path.name)
 
     @property
     def url(self) -> str:
-        """A URL that contains the picture."""
+        """Data URL of the picture."""
         return f"data:image/png;base64,{base64.b64encode(self.png).decode('ascii')}"
 
 
 def render_page(template: str, *, generator: str = "surgsim", **values: Any) -> str:
-    """The text of a page: a template of `templates/` with its values; `generator` names the program that makes it."""
+    """Text of a page: a template of `templates/` with its values; `generator` names its program."""
     return _templates().get_template(template).render(generator=generator, policy=POLICY, **values)
 
 

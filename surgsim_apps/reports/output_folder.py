@@ -1,4 +1,4 @@
-"""Results of a command: written into a temporary folder beside their places, and renamed at the end."""
+"""Results of a command, written into a temporary folder beside their places and renamed at the end."""
 
 import contextlib
 import itertools
@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-# Names of the temporary folders begin with this.
+# Prefix of temporary folders.
 PART = ".surgsim-part-"
 
 
@@ -18,8 +18,8 @@ class OutputFolder:
     """Temporary place of a command's results; made by `output_folder`.
 
     Fields:
-        path: the folder in which the results appear at the end
-        part: the folder that holds them until then
+        path: of the results at the end
+        part: of the results until then
     """
 
     path: Path
@@ -40,12 +40,12 @@ class OutputFolder:
 
 @contextlib.contextmanager
 def output_folder(folder: Path, names: Sequence[str] = (), *, numbered: bool = False) -> Iterator[OutputFolder]:
-    """Where results are written in a `with`; at its end they appear in a folder, after an error none does.
+    """Folder for results in a `with`: they appear at its end together, after an error none does.
 
     Args:
         folder: of the results; created if necessary.
-        names: of all results that the command can write; older files of these names are removed with the set.
-        numbered: whether the results go into the first free FOLDER-NUMBER.
+        names: of all possible results; older files of these names are removed.
+        numbered: use the first free FOLDER-NUMBER.
 
     Raises:
         OSError: the folder or a result cannot be written.
@@ -70,16 +70,16 @@ def output_folder(folder: Path, names: Sequence[str] = (), *, numbered: bool = F
     finally:
         shutil.rmtree(part, ignore_errors=True)
         if is_new:
-            # It is removed where nothing was written.
+            # A folder with results stays.
             with contextlib.suppress(OSError):
                 root.rmdir()
 
 
 def next_free(path: Path) -> Path:
-    """The first STEM-NUMBER.SUFFIX beside a path that is not there."""
+    """First free STEM-NUMBER.SUFFIX beside a path."""
     numbered = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in itertools.count(1))
     return next(place for place in numbered if not place.exists())
 
 
-# A folder of results, at once or at the end.
+# Folder of results, written at once or at the end.
 AnyFolder = Path | OutputFolder

@@ -1,4 +1,4 @@
-"""An organ's surface drawn without GL: curved, shaded triangles in orthographic projection, painted with a map."""
+"""Drawing of an organ's surface without GL: curved, shaded triangles in orthographic projection, with a map."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, PAPER = "#20242c", "white"
-# Each triangle is drawn as SPLITS^2, or fewer where this would exceed a number of patches, bent towards its corners'
-# tangent planes by a share (Boubekeur & Alexa 2008).
+# A triangle is drawn as SPLITS^2 patches, or fewer to stay below PATCHES_MOST, bent towards its corners' tangent planes
+# by a share (Boubekeur & Alexa 2008).
 SPLITS = 4
 PATCHES_MOST = 100_000
 BEND = 0.6
-# Corners where a face turns from the mean normal by more than this stay sharp.
+# Least cosine between a face and the mean normal of a smooth corner.
 CREASE_COSINE = 0.75
 AMBIENT, DIFFUSE, GLOSS, SHININESS = 0.42, 0.62, 0.16, 22.0
-# The map fades out between these distances from the nearest site, in site spacings.
+# Distances of the map's fading from the nearest site, in site spacings.
 FADE_FROM, FADE_TO = 0.75, 1.15
 
 
 @dataclass(frozen=True, eq=False)
 class OrthographicView:
-    """An orthographic view along a direction: unit vectors to the right and up in the picture, and to the viewer."""
+    """Orthographic view: unit vectors to the right and up in the picture, and to the viewer."""
 
     right: FloatArray
     up: FloatArray
@@ -38,11 +38,10 @@ class OrthographicView:
 
     @classmethod
     def along(cls, direction: FloatArray, up: FloatArray | None = None) -> OrthographicView:
-        """The view along a direction; without `up`, as the raster of a palpable face lies."""
+        """View along a direction; without `up`, upright as the raster of a palpable face."""
         towards = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
         if up is None:
-            right, upward = tangent_axes(-towards)
-            return cls(right, upward, towards)
+            return cls(*tangent_axes(-towards), towards)
         right = np.cross(up, towards)
         right /= np.linalg.norm(right)
         return cls(right, np.cross(towards, right), towards)
@@ -54,7 +53,7 @@ class OrthographicView:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Small triangles to draw: corners [m] (n, 3, 3), normals (n, 3), index of the triangle each came from (n,)."""
+    """Small triangles to draw: corners [m] (n, 3, 3), normals (n, 3), index of their triangle (n,)."""
 
     corners: FloatArray
     normals: FloatArray
@@ -62,7 +61,7 @@ class Patches:
 
 
 def organ_patches(anatomy: Anatomy) -> Patches:
-    """An organ at rest; each patch came from the boundary triangle of the tets that it is a part of or lies over.
+    """Patches of an organ at rest, with the boundary triangles of the tets below them.
 
     Raises:
         MeshError: the scene's fine surface cannot be read, or is not of this organ.
@@ -72,13 +71,13 @@ def organ_patches(anatomy: Anatomy) -> Patches:
     if anatomy.fine_surface is None:
         return patches
     first, second, third = surface_carriers(points, anatomy.mesh).triangle[triangles.T]
-    # That of two corners at least, where there is one: borders of colours are smoother than with one corner's.
+    # The triangle of two corners, if any, gives smoother borders of colours than that of a single one.
     below = np.where(second == third, second, first)
     return replace(patches, origin=below[patches.origin])
 
 
 def curved_patches(points: FloatArray, triangles: IntArray, splits_most: int = SPLITS) -> Patches:
-    """Each triangle of a surface as up to splits_most^2 smaller triangles, bent towards the smooth normals."""
+    """Patches of a surface, up to splits_most^2 of a triangle, bent towards the smooth normals."""
     splits = max(k for k in range(1, splits_most + 1) if k == 1 or len(triangles) * k * k <= PATCHES_MOST)
     corners = points[triangles]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -103,13 +102,13 @@ def curved_patches(points: FloatArray, triangles: IntArray, splits_most: int = S
 
 
 def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
-    """A continuous field near the values at the sites [m] (n, 3), at other places (m, 3): radial functions."""
+    """Values at places (m, 3) of a continuous field near the values at sites [m] (n, 3), by radial functions."""
     from scipy.interpolate import RBFInterpolator
     from scipy.spatial import KDTree
 
     if len(sites) < 8 or np.ptp(values) == 0.0:
         return values[KDTree(sites).query(places)[1]]
-    # In the best-fit plane of the sites: a flat face determines nothing across it.
+    # In the best-fit plane of the sites: a flat face has no extent across it.
     centred = sites - sites.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
     field = RBFInterpolator(
@@ -119,7 +118,7 @@ def interpolated(sites: FloatArray, values: FloatArray, places: FloatArray) -> F
 
 
 def nearness(sites: FloatArray, places: FloatArray, spacing: float, fade_to: float = FADE_TO) -> FloatArray:
-    """Opacity of a map at each place: 1 near a site, fading to 0 beyond, shape (m,)."""
+    """Opacity of a map at each place, 1 near a site, fading to 0 beyond, shape (m,)."""
     from scipy.spatial import KDTree
 
     distance = KDTree(sites).query(places)[0] / spacing
@@ -138,7 +137,7 @@ def shaded(colours: FloatArray, normals: FloatArray, view: OrthographicView, glo
 
 
 def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray, IntArray]:
-    """Points and outward triangles of a capsule between two points; of a ball where they are the same."""
+    """Points and outward triangles of a capsule between two points, or of a ball at a single point."""
     along = end - start
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
@@ -155,12 +154,14 @@ def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray,
     quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     vertices = np.concatenate(points)
-    # Triangles that face inward are flipped: the axes may be left-handed.
+    # Left-handed axes give inward triangles, which are flipped.
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     keep = np.linalg.norm(normal, axis=1) > 1e-16
-    outward = corners.mean(axis=1) - (start + np.clip((corners.mean(axis=1) - start) @ axis, 0, length)[:, None] * axis)
-    triangles[(normal * outward).sum(axis=1) < 0.0] = triangles[(normal * outward).sum(axis=1) < 0.0][:, [0, 2, 1]]
+    middle = corners.mean(axis=1)
+    outward = middle - (start + np.clip((middle - start) @ axis, 0, length)[:, None] * axis)
+    inward = (normal * outward).sum(axis=1) < 0.0
+    triangles[inward] = triangles[inward][:, [0, 2, 1]]
     return vertices, triangles[keep].astype(np.int32)
 
 
@@ -171,14 +172,14 @@ def draw_patches(
     zorder: int = 1,
     flatness: float = 0.0,
 ) -> None:
-    """Draw patches from the farthest to the nearest, those that face away left out.
+    """Draw patches from the farthest to the nearest, without those that face away.
 
     Args:
         axes: to draw in.
         parts: patches, their colours (n, 3) and gloss.
         view: of them.
         zorder: matplotlib's.
-        flatness: 0 with the light's full shading, 1 in the colours as given.
+        flatness: 0 for full shading, 1 for the given colours.
     """
     from matplotlib.collections import PolyCollection
 
@@ -191,7 +192,7 @@ def draw_patches(
     order = order[normals[order] @ view.towards > -0.15]
     face = colours[order]
     axes.add_collection(
-        # An array, which matplotlib's types lack, takes a fifth of the time of a list.
+        # An array, unknown to matplotlib's types, takes a fifth of the time of a list.
         PolyCollection(
             cast(Any, view.flat(corners[order])), facecolors=face, edgecolors=face, linewidths=0.8, zorder=zorder
         )
@@ -200,5 +201,5 @@ def draw_patches(
 
 
 def save_png(figure: Figure, path: Path, facecolor: str = PAPER) -> None:
-    """Write a figure without GL or display; the same bytes for the same figure."""
+    """Write a figure without display; equal figures give equal bytes."""
     figure.savefig(path, format="png", facecolor=facecolor)

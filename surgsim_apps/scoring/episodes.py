@@ -1,7 +1,7 @@
-"""Play episodes of given seeds side by side, record them, and the figures of a policy.
+"""Episodes of given seeds, played in vectorised environments and recorded, and the figures of a policy.
 
-An agent draws from `agent_generator(seed)`, which no environment uses. One whose class declares `sees_truth = True` is
-given the task with the truth by its method `see`; no other is given it.
+An agent draws from `agent_generator(seed)`, separate from all environments. Only an agent of a class that declares
+`sees_truth = True` gets the task with the truth, by its method `see`.
 """
 
 import math
@@ -13,57 +13,50 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from surgsim_apps.scoring.figures import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation import (
-    HOLD_TIME,
-    PRESS_SPEED,
-    MapScore,
-    PalpationRecord,
-    ScoreEstimate,
-    press_errors,
-    with_intervals,
-)
+from surgsim_env.palpation import HOLD_TIME, PRESS_SPEED
 from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
 from surgsim_env.tasks import SUCCESS_ERROR, PalpateSitesTask
 
-# Of the seeds that belong to agents, among those that follow from an episode's (`SeedSequence.spawn_key`).
+# Spawn key of the agents' random numbers in the `SeedSequence` of an episode.
 AGENT_STREAM = 0x41_67_65_6E_74
-# Actions (n, n_action) for observations (n, n_observation), or for a dictionary of arrays (n, ...); where the second
-# (n,) is true an episode begins.
+# Actions (n, n_action) for observations (n, n_observation), or for a dictionary of arrays (n, ...), and a mask (n,) of
+# environments that begin an episode.
 Actor = Callable[[Any, NDArray[np.bool_]], NDArray[Any]]
 
 
 @runtime_checkable
 class EpisodeActor(Protocol):
-    """An `Actor` that is told where an episode begins and ends, as one with random numbers or a memory has to be."""
+    """An `Actor` with random numbers or a memory of its own for each episode."""
 
     def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
-        """Begin an episode in environment `index`, with random numbers that follow from its seed."""
+        """Begin an episode in environment `index`, with random numbers from its seed."""
         ...
 
     def end(self, index: int) -> None:
-        """The episode of environment `index` is over, if there was one."""
+        """End the episode of environment `index`, if there is one."""
         ...
 
     def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[Any]:
-        """Actions, as an `Actor` gives them."""
+        """Actions of an `Actor`."""
         ...
 
 
 def make_envs(
     env_id: str, count: int, *, dtype: str = "float32", threads: int = 1, **kwargs: Any
 ) -> gym.vector.VectorEnv:
-    """Environments side by side that reset when `play` says so."""
+    """Vectorised environments for `play`, without automatic resets."""
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "dtype": dtype}
     return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
 
 
 def agent_generator(seed: int) -> np.random.Generator:
-    """The random numbers of the agent that plays the episode of a seed.
+    """Random numbers of the agent in the episode of a seed.
 
     An environment draws its episode from `default_rng(seed)`: an agent with that generator could redraw the lesions.
-    This one begins with words that a child of the seed's `SeedSequence` gives, so that it holds neither the seed nor
-    the environment's numbers.
+    This one begins with words of a child of the seed's `SeedSequence`: it reveals neither the seed nor the
+    environment's numbers.
     """
     child = np.random.SeedSequence(seed, spawn_key=(AGENT_STREAM,))
     return np.random.default_rng(child.generate_state(8).tolist())
@@ -76,13 +69,13 @@ def play(
     begin: Callable[[int, int], Any],
     progress: Callable[[int], object] = lambda ended: None,
 ) -> list[Any]:
-    """Play an episode of each seed and return its record; where one ends the next seed begins.
+    """Records of an episode of each seed; an environment that ends one begins that of the next seed.
 
-    Environments for which no seed is left are paused (`LaneVectorEnv.pause`).
+    Environments without a further seed are paused (`LaneVectorEnv.pause`).
 
     Args:
-        actor: what plays. An episode's record does not depend on the others where the actor's actions do not: those
-            of an `EpisodeActor` may draw from the random numbers of each episode.
+        actor: gives the actions. An `EpisodeActor` may draw from each episode's own random numbers: its records do not
+            depend on the other episodes.
         envs: of `make_envs`.
         seeds: of the episodes.
         begin: makes the record of an episode from the index of its environment and its seed; its `note` takes steps.
@@ -98,7 +91,7 @@ def play(
         idle = np.array([index is None for index in playing])
         if idle.all():
             return [records[index] for index in range(len(seeds))]
-        # All environments are reset once, with the first seed where there is no other: an observation is of all.
+        # All environments are reset once, also those without a seed (by the first): an observation is of all.
         resets = begins & ~idle if records else np.ones_like(begins)
         if resets.any():
             starts = [int(seeds[index or 0]) for index in playing]
@@ -127,10 +120,10 @@ def play(
 
 @dataclass(frozen=True)
 class EpisodeFacts:
-    """Constants of an environment whose steps are control steps.
+    """Constants of an environment with control steps.
 
     Fields:
-        env_id, env_kwargs: of the environment; an agent may make one of its own from them
+        env_id, env_kwargs: of the environment; an agent may make its own from them
         observation_slices: entries of an observation, by channel
         action_size: entries of an action, each in [-1, 1]
         control_step: duration of a step [s]
@@ -149,7 +142,7 @@ class EpisodeFacts:
 
 
 def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeFacts:
-    """The facts of an environment (its wrappers do not matter)."""
+    """Facts of an environment, without its wrappers."""
     single = env.unwrapped
     return EpisodeFacts(
         env_id=env_id,
@@ -164,15 +157,15 @@ def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeF
 
 
 def sees_truth(agent: object) -> bool:
-    """Whether an agent's class declares that it may see the truth."""
+    """True if an agent's class declares a view of the truth."""
     return bool(getattr(type(agent), "sees_truth", False))
 
 
 def check_agent(agent: object, name: str) -> None:
-    """Check that an agent has the methods that an episode calls; messages call it `name`.
+    """Check an agent for the methods of an episode; messages call it `name`.
 
     Raises:
-        ValueError: a method is missing, or `see` is there and its class does not declare that it sees the truth.
+        ValueError: a missing method, or a method `see` without `sees_truth = True`.
     """
     has = {
         method: callable(getattr(type(agent), method, None))
@@ -190,21 +183,21 @@ def check_agent(agent: object, name: str) -> None:
 
 
 class AgentActor:
-    """An agent for each episode, with random numbers that no environment uses."""
+    """An agent for each episode, with its own random numbers."""
 
     def __init__(self, make: Callable[[], Any], facts: Callable[[Any], Any] = site_facts) -> None:
-        """Play agents that `make` gives.
+        """Play agents of a constructor.
 
         Args:
-            make: an agent as docs/own_agent.md says.
-            facts: gives an agent the constants of its environment, by default `SiteFacts`.
+            make: makes an agent (docs/own_agent.md).
+            facts: constants of an environment for its agent, by default `SiteFacts`.
         """
         self.make, self.facts = make, facts
         self.agents: dict[int, Any] = {}
         self._idle = np.zeros(0, dtype=np.float32)
 
     def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
-        """Make the agent of an episode in environment `index`."""
+        """Make the agent of environment `index` for an episode."""
         agent = self.agents[index] = self.make()
         self._idle = np.zeros(env.action_space.shape, dtype=np.float32)
         agent.reset(rng, self.facts(env))
@@ -216,12 +209,12 @@ class AgentActor:
         self.agents.pop(index, None)
 
     def __call__(self, observations: Any, begins: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """The next action of each agent (n, n_action); 0 where an environment has none."""
-        chosen = [
+        """The next action of each agent (n, n_action); 0 for an environment without one."""
+        actions = [
             self.agents[index].act(selected_observations(observations, index)) if index in self.agents else self._idle
             for index in range(len(begins))
         ]
-        return np.stack(chosen)
+        return np.stack(actions)
 
 
 # ---- SurgSim/Palpate-v0 and Retract-v0 ------------------------------------------------------------------------------
@@ -250,19 +243,19 @@ def play_tasks(
     seeds: Sequence[int],
     progress: Callable[[int], object] = lambda ended: None,
 ) -> list[TaskRecord]:
-    """`play` for the records of these environments."""
+    """`play` with a `TaskRecord` for each episode."""
     return play(actor, envs, seeds, lambda env, seed: TaskRecord(), progress)
 
 
 def play_scripts(
     env: gym.Env, seeds: Sequence[int], *, tracks: bool, progress: Callable[[int], object] = lambda ended: None
 ) -> list[TaskRecord]:
-    """Episodes of the oracle's script, one after the other; a script that fails ends its episode without success.
+    """Episodes of the oracle's script, one after the other; a failed script ends its episode without success.
 
     Args:
         env: one environment.
         seeds: of the episodes.
-        tracks: the script follows a surface that moves.
+        tracks: True to follow a moving surface.
         progress: called with 1 after each episode.
     """
     records = []
@@ -286,7 +279,7 @@ def task_figures(
     Args:
         records: at least one.
         control_step: duration of a step [s].
-        soft_force: [N]; an episode counts as gentle where no step's largest force passes it.
+        soft_force: [N]; limit of the force in a gentle episode.
         rng: for the bootstrap.
     """
     succeeded = [bool(record.last["success"]) for record in records]
@@ -320,10 +313,10 @@ def play_sites(
     seeds: Sequence[int],
     progress: Callable[[int], object] = lambda ended: None,
 ) -> list[PalpationRecord]:
-    """`play` for agents, or for one policy in all environments.
+    """`play` with a `PalpationRecord` for each episode.
 
-    An agent with methods `estimate` and `estimate_map`, as `surgsim_apps.scoring.site_search.TruthAgent` has them,
-    replaces the estimator.
+    An agent's methods `estimate` and `estimate_map` (`surgsim_apps.scoring.site_search.TruthAgent`) replace the
+    estimator.
     """
     singles = envs.unwrapped.envs  # type: ignore[attr-defined]
 
@@ -331,22 +324,22 @@ def play_sites(
         agent = actor.agents[index] if isinstance(actor, AgentActor) else None
         return SiteRecord(singles[index].unwrapped.task, agent if estimates_itself(agent) else None)
 
-    return [one.record for one in play(actor, envs, seeds, begin, progress)]
+    return [site_record.record for site_record in play(actor, envs, seeds, begin, progress)]
 
 
 def estimates_itself(agent: object) -> bool:
-    """Whether an agent's own estimate is scored in place of the common estimator's: its class has the method."""
+    """True if an agent's class has a method `estimate`: scored instead of the common estimator."""
     return callable(getattr(type(agent), "estimate", None))
 
 
 def site_success(record: PalpationRecord, task: PalpateSitesTask) -> bool:
-    """Whether an episode ended in success, by the estimate that is scored: no harm, and the last error small enough."""
+    """True for an episode without harm and with a small last error of the scored estimate."""
     harmed = record.hard_limit or bool(record.fault)
     return not harmed and bool(press_errors(record, task.budget)[-1] <= SUCCESS_ERROR * task.tip_scale)
 
 
 class SiteRecord:
-    """A record of presses; the estimates of `reference`, an agent, replace the estimator's."""
+    """Record of an episode's presses; the estimates of an agent `reference` replace the estimator's."""
 
     def __init__(self, task: PalpateSitesTask, reference: Any) -> None:
         self.task, self.reference = task, reference
@@ -355,15 +348,13 @@ class SiteRecord:
 
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a press; the last one completes the record."""
-        reference = self.reference
-        said = self.task.estimated if reference is None else self._own_places()
-        self.estimates.append(np.array(said))
+        self.estimates.append(np.array(self.task.estimated if self.reference is None else self._own_places()))
         self.forces.append((float(info["force"]), float(info["force_peak"]), float(info["depth"])))
         if over:
             self._complete(info)
 
     def _complete(self, info: dict[str, Any]) -> None:
-        made = map_score(self.task)
+        score = map_score(self.task)
         force, peak, depth = np.array(self.forces).T
         self.record = PalpationRecord(
             truth=self.task.truth.copy(),
@@ -378,22 +369,21 @@ class SiteRecord:
             soft_force=self.task.limits.soft_force,
             hard_limit=bool(info["hard_limit"]),
             fault=str(info["sim_fault"]),
-            map=made if self.reference is None else self._own_map(made),
+            map=score if self.reference is None else self._own_map(score),
         )
 
     def _own_places(self) -> NDArray[np.float64]:
-        """The agent's own estimate."""
         return np.asarray(self.reference.estimate(self.task.charted.surface), dtype=np.float64).reshape(-1, 3)
 
-    def _own_map(self, made: MapScore) -> MapScore:
-        """The agent's own map beside the truth, which only one that declares it sees."""
-        hidden = {"lesion": np.zeros_like(made.lesion), "outline_true": np.zeros_like(made.outline_true)}
-        said = self.reference.estimate_map(made if sees_truth(self.reference) else replace(made, **hidden))
-        return replace(made, excess=said.excess, outline=said.outline)
+    def _own_map(self, score: MapScore) -> MapScore:
+        """The agent's own map beside the truth, hidden from an agent without `sees_truth`."""
+        hidden = {"lesion": np.zeros_like(score.lesion), "outline_true": np.zeros_like(score.outline_true)}
+        own = self.reference.estimate_map(score if sees_truth(self.reference) else replace(score, **hidden))
+        return replace(score, excess=own.excess, outline=own.outline)
 
 
 def map_score(task: PalpateSitesTask) -> MapScore:
-    """The task's last estimate as a map, with the lesions seen along the approach."""
+    """The task's last estimate as a map, beside the lesions along the approach."""
     estimate, chart = task.estimate, task.charted.chart
     across, along = estimate.axes
     points = np.stack(np.meshgrid(across, along), axis=-1)
@@ -410,7 +400,7 @@ def map_score(task: PalpateSitesTask) -> MapScore:
 
 
 def _over_lesion(task: PalpateSitesTask, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether places of the chart (..., 2) [m] lie over a lesion, seen along the approach."""
+    """Mask of places of the chart (..., 2) [m] over a lesion, along the approach."""
     over = np.zeros(points.shape[:-1], dtype=bool)
     chart = task.charted.chart
     for lesion in task.lesions:

@@ -1,7 +1,7 @@
-"""Play a method on seeds, score it, and write the result: baselines, trained policies, agents of others.
+"""Evaluation of a method on seeds, and its result file: baselines, trained policies, agents of others.
 
 Results of the project's own methods on all evaluation seeds go to agents/results of a checkout, one file per method,
-scene and level. Other results are printed, and written where the option `results` says.
+scene and level. Other results are printed, and written into the folder of the option `results`.
 """
 
 import datetime
@@ -38,6 +38,7 @@ from surgsim_apps.scoring.episodes import (
 )
 from surgsim_apps.scoring.expert_palpate import PalpateExpert
 from surgsim_apps.scoring.expert_retract import RetractExpert
+from surgsim_apps.scoring.figures import PalpationRecord, press_errors, score, with_intervals
 from surgsim_apps.scoring.options import ScoringOptions
 from surgsim_apps.scoring.results import (
     SITES,
@@ -48,32 +49,31 @@ from surgsim_apps.scoring.results import (
 )
 from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation import PalpationRecord, press_errors, score, with_intervals
 from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
 from surgsim_env.step_progress import StepProgress
 
 # Seed of the bootstrap.
 BOOTSTRAP_SEED = 0
-# Where a method plays unless options say otherwise.
+# Default scene and level of an evaluation.
 PLACES = {"scene": "phantom", "level": "standard"}
-# Arguments of SurgSim/Palpate-v0 with which organs of any size and pose are alike.
+# Arguments of SurgSim/Palpate-v0 for observations independent of an organ's size and pose.
 IN_FACE = {"memory": True, "frame": "face"}
-# The members of a family that scores are of.
+# Default split of a family of organs.
 SCORED_SPLIT = "test"
 
 
 @dataclass(frozen=True)
 class Player:
-    """What is scored, and where.
+    """A method with its environment.
 
     Args:
         name: of the method.
-        actor: what plays; None: the oracle's script.
+        actor: gives the actions; None: the oracle's script.
         env_id, kwargs: the environment.
         chosen_by: the option of `surgsim evaluate` that names it, and its value.
-        sees_truth: whether it may see what is hidden.
-        own_estimate: whether its own estimate is scored.
-        ours: whether its result belongs in agents/results.
+        sees_truth: True if it may see hidden truth.
+        own_estimate: True if its own estimate is scored.
+        ours: True if its result belongs in agents/results.
     """
 
     name: str
@@ -101,15 +101,11 @@ class TaskAgent:
     kwargs: dict[str, Any] = field(default_factory=dict)
 
 
-def _organ_expert(*, blind: bool) -> Callable[[dict[str, Any]], Actor]:
-    """Makes the expert for any organ, which needs torch."""
+def _organ_expert(*, blind: bool) -> Actor:
+    # It needs torch.
+    from surgsim_apps.scoring.expert_organs import OrganExpert
 
-    def make(kwargs: dict[str, Any]) -> Actor:
-        from surgsim_apps.scoring.expert_organs import OrganExpert
-
-        return OrganExpert(blind=blind).act
-
-    return make
+    return OrganExpert(blind=blind).act
 
 
 TASK_AGENTS = {
@@ -119,12 +115,10 @@ TASK_AGENTS = {
         lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
         {"memory": True},
     ),
-    "expert_organs": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=False), IN_FACE),
-    "blind_middle": TaskAgent("SurgSim/Palpate-v0", _organ_expert(blind=True), IN_FACE),
+    "expert_organs": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=False), IN_FACE),
+    "blind_middle": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=True), IN_FACE),
 }
-
-
-# Environments whose oracle plays its script.
+# Oracles that play a script, by environment.
 ORACLES = {
     "oracle_palpate": "SurgSim/Palpate-v0",
     "oracle_retract": "SurgSim/Retract-v0",
@@ -133,18 +127,18 @@ ORACLES = {
 
 
 def policies_folder() -> Path:
-    """The folder of the policies that are shipped."""
+    """The folder of the shipped policies."""
     return agents_folder() / "policies"
 
 
 def named_class(text: str, option: str) -> Any:
-    """The class (or any function that makes an agent) of MODULE:CLASS; modules of the working folder are found too.
+    """The class, or other constructor of agents, of MODULE:CLASS; the module may lie in the working folder.
 
     Importing the module runs its code.
 
     Args:
         text: MODULE:CLASS.
-        option: where it was given, for messages.
+        option: its option, for messages.
 
     Raises:
         ValueError: another text, or no such module or class.
@@ -156,14 +150,14 @@ def named_class(text: str, option: str) -> Any:
     if not {"", str(Path.cwd())} & set(sys.path):
         sys.path.insert(0, str(Path.cwd()))
     try:
-        found = importlib.import_module(module)
+        imported = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise
         raise ValueError(f"{option} {text}: there is no module {error.name!r} on Python's path") from None
-    if not callable(getattr(found, name, None)):
+    if not callable(getattr(imported, name, None)):
         raise ValueError(f"{option} {text}: {module} has no class {name!r}")
-    return getattr(found, name)
+    return getattr(imported, name)
 
 
 def strangers_actor(text: str, option: str, env_id: str, env_kwargs: dict[str, Any]) -> AgentActor:
@@ -171,12 +165,12 @@ def strangers_actor(text: str, option: str, env_id: str, env_kwargs: dict[str, A
 
     Args:
         text: MODULE:CLASS.
-        option: where it was given, for messages.
-        env_id: of the environment that it plays.
-        env_kwargs: of the environment, as an agent is given them.
+        option: its option, for messages.
+        env_id: of its environment.
+        env_kwargs: of its environment.
 
     Raises:
-        ValueError: as in `named_class` and `check_agent`, or it cannot be made without arguments.
+        ValueError: of `named_class` and `check_agent`, or a class that needs arguments.
     """
     make = named_class(text, option)
     try:
@@ -188,7 +182,7 @@ def strangers_actor(text: str, option: str, env_id: str, env_kwargs: dict[str, A
 
 
 def evaluate_all(options: ScoringOptions, console: Console) -> None:
-    """Every baseline on the scene and level of the options, then every shipped policy that can play there."""
+    """Evaluate every baseline on the scene and level of the options, then every shipped policy for that scene."""
     from surgsim_apps.training.policy_files import read_description
 
     places = _places(options, PLACES)
@@ -200,8 +194,8 @@ def evaluate_all(options: ScoringOptions, console: Console) -> None:
         if name not in skipped:
             evaluate(find_player(name, options), options, console)
     for path in sorted(policies_folder().glob("*.json")):
-        described = read_description(path)
-        if described.plays_every_scene or described.home_scene == Path(places["scene"]).stem:
+        description = read_description(path)
+        if description.plays_every_scene or description.home_scene == Path(places["scene"]).stem:
             evaluate(policy_player(path, options), options, console)
 
 
@@ -209,7 +203,7 @@ def find_player(name: str, options: ScoringOptions) -> Player:
     """The player of a name: a site search, a script of another environment, an oracle, or MODULE:CLASS.
 
     Raises:
-        ValueError: an unknown name, or a class that is not there.
+        ValueError: an unknown name or class.
     """
     chosen_by = ("--agent", name)
     if ":" in name:
@@ -236,16 +230,16 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
         if argument in options.env_kwargs and getattr(options, argument) is not None:
             raise ValueError(f"{argument} is given by --{argument} and in --env-arguments: leave one out")
     own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
-    # A split that --env-arguments name is meant.
+    # A split in --env-arguments precedes the default one.
     kwargs = {**_places(options, own), **options.env_kwargs}
-    given = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
-    actor = strangers_actor(name, "--agent", env_id, given)
+    all_kwargs = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
+    actor = strangers_actor(name, "--agent", env_id, all_kwargs)
     declared = _declared(actor.make())
     return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, ours=False)
 
 
 def _defaults(env_id: str) -> dict[str, str]:
-    """Scene and level where options give none; of an environment without levels none."""
+    """Default scene and level; none for an environment without levels."""
     return PLACES if "Palpate" in env_id else {}
 
 
@@ -255,13 +249,13 @@ def _declared(agent: Any) -> tuple[bool, bool]:
 
 
 def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]:
-    """Scene, level and split as the options or else the defaults have them; else they are the environment's own.
+    """Scene, level and split of the options, else of the defaults; missing ones are the environment's own.
 
-    A family of organs is scored on its test split unless the options name another, also where a method was trained on
-    the family's training split.
+    A family of organs is scored on its test split unless the options name another, even for a method trained on its
+    training split.
     """
-    given = {name: getattr(options, name) for name in PLACES if getattr(options, name) is not None}
-    places = {name: value for name, value in {**defaults, **given}.items() if name in PLACES}
+    chosen = {name: getattr(options, name) for name in PLACES if getattr(options, name) is not None}
+    places = {name: value for name, value in {**defaults, **chosen}.items() if name in PLACES}
     is_family = places.get("scene") is not None and make_scene(places["scene"]).family is not None
     if options.split is not None or is_family:
         places["split"] = options.split or SCORED_SPLIT
@@ -269,14 +263,14 @@ def _places(options: ScoringOptions, defaults: dict[str, str]) -> dict[str, Any]
 
 
 def policy_player(path: Path, options: ScoringOptions) -> Player:
-    """A trained policy on its own environment, or on the scene and level of the options where it can play them.
+    """A trained policy on its own environment, with scene and level of the options.
 
     Args:
         path: of either of its files, or the name of a shipped policy.
         options: of the evaluation.
 
     Raises:
-        ValueError: no such policy, or one that cannot play there.
+        ValueError: no such policy, or one for another scene.
     """
     from surgsim_apps.training.policy_files import load_policy
 
@@ -288,18 +282,15 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
     kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
     policy.reset(min(options.envs, len(options.played_seeds)))
-
-    return Player(
-        *(path.stem, policy, env_id, kwargs, ("--policy", str(_from_here(path)))),
-        ours=path.resolve().parent == policies_folder(),
-    )
+    ours = path.resolve().parent == policies_folder()
+    return Player(path.stem, policy, env_id, kwargs, ("--policy", _from_here(path)), ours=ours)
 
 
 def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
-    """The environment's arguments, with those that options add.
+    """Arguments of the environment, with those of the options.
 
     Raises:
-        ValueError: an option that this player or its environment cannot take.
+        ValueError: an option that does not suit this player or its environment.
     """
     kwargs = dict(player.kwargs)
     if options.motion is not None:
@@ -319,7 +310,7 @@ def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
 
 
 def evaluate(player: Player, options: ScoringOptions, console: Console) -> Result:
-    """Play the seeds of the options; print the result and write it where it belongs."""
+    """Play the seeds of the options; print the result and write its file."""
     kwargs, seeds, env_id, actor = _arguments(player, options), options.played_seeds, player.env_id, player.actor
     name = player.name + "_untracked" * options.no_tracking
     rng = np.random.default_rng(BOOTSTRAP_SEED)
@@ -341,7 +332,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
             single = gym.make(env_id, **kwargs)
             records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=ended)
             succeeded, scored = _task_scores(records, first, rng)
-    taken = time.perf_counter() - start
+    wall_time = time.perf_counter() - start
     envs.close()
     result = Result(
         method=name,
@@ -349,7 +340,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         env_kwargs=_without_folders(kwargs),
         seeds=tuple(seeds),
         command=_command(player, options),
-        wall_time=round(taken, 1),
+        wall_time=round(wall_time, 1),
         date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         physics_version=PHYSICS_VERSION,
         successes=succeeded,
@@ -367,7 +358,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
 
 
 def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
-    """Whether each episode of presses succeeded, and the entries of a `Result` that follow from them."""
+    """Success of each episode of presses, and their entries of a `Result`."""
     succeeded = [site_success(record, task) for record in presses]
     share = {"success": np.array(succeeded, dtype=np.float64)}
     return succeeded, {
@@ -379,7 +370,7 @@ def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Gener
 
 
 def _task_scores(records: list[TaskRecord], env: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
-    """Whether each episode of control steps succeeded, and the entries of a `Result` that follow from them."""
+    """Success of each episode of control steps, and their entries of a `Result`."""
     return [bool(record.last["success"]) for record in records], {
         "budget": env.task.episode_steps or 0,
         "figures": task_figures(records, env.scene.timing.control_step, env.scene.limits.soft_force, rng),
@@ -391,10 +382,7 @@ def _say(console: Console, text: str) -> None:
 
 
 def _write(result: Result, player: Player, options: ScoringOptions) -> Path | None:
-    """Write a result where it belongs.
-
-    agents/results holds the project's own methods on the project's own scenes alone, as `ScoringOptions.standard` says.
-    """
+    """Write a result into the folder of the options, or a standard result of ours on our scenes into agents/results."""
     if options.results is not None:
         return result.save(options.results)
     own_place = result.env_kwargs.get("scene") in (None, *list_scenes())
@@ -403,9 +391,9 @@ def _write(result: Result, player: Player, options: ScoringOptions) -> Path | No
     return None
 
 
-def print_comparison(one: Path, other: Path, console: Console) -> None:
-    """Print the differences of the results of two files."""
-    first, second = load_result(one), load_result(other)
+def print_comparison(paths: tuple[Path, Path], console: Console) -> None:
+    """Print the differences of two results."""
+    first, second = map(load_result, paths)
     _say(
         console,
         f"{first.place}, seeds {seeds_text(first.seeds)}: differences with 95 % intervals of a paired bootstrap",
@@ -415,7 +403,7 @@ def print_comparison(one: Path, other: Path, console: Console) -> None:
 
 
 def _command(player: Player, options: ScoringOptions) -> str:
-    """The command that repeats a result: what is scored, and the options that change its figures."""
+    """The command that repeats a result: the method, and the options with an effect on its figures."""
     words = ["surgsim", "evaluate", *player.chosen_by]
     for option in fields(options):
         value = getattr(options, option.name)
@@ -428,7 +416,7 @@ def _command(player: Player, options: ScoringOptions) -> str:
 
 
 def _without_folders(kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Arguments with files relative to the checkout or by their names, so that no machine's folders are written."""
+    """Arguments with paths of `_from_here`."""
     return {
         name: _from_here(Path(value)) if isinstance(value, str) and Path(value).is_absolute() else value
         for name, value in kwargs.items()
@@ -436,13 +424,13 @@ def _without_folders(kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 def _from_here(path: Path) -> str:
-    """The path relative to the checkout, so that no machine's folders are written."""
+    """The path relative to the checkout, else the file's name: results hold no folders of a machine."""
     absolute, checkout = path.resolve(), _checkout()
     inside = checkout is not None and absolute.is_relative_to(checkout)
     return absolute.relative_to(checkout).as_posix() if inside else path.name  # type: ignore[arg-type]
 
 
 def _checkout() -> Path | None:
-    """The folder of the checkout that this package belongs to; None where it is installed."""
+    """The folder of this package's checkout; None for an installed package."""
     folder = agents_folder().parent
     return folder if (folder / "pyproject.toml").is_file() else None

@@ -1,10 +1,10 @@
 """A scripted expert for SurgSim/Palpate-v0 on any organ, with memory=True and frame="face".
 
-It has no state: each action is a function of `surgsim_apps.training.face_features`, which an observation alone gives,
-so that a network can learn it (`agents/learn_palpate_organs.py`). The tip slides at a constant depth along rows of the
-face, less deep where the force nears the soft limit. Where it has passed a place that is clearly stiffer than most of
-what it felt, or the rows are done, it searches across the row there, goes to the stiffest place and declares it.
-Lengths are in tip radii and forces over the soft limit: what works on one organ works on another.
+It has no state: each action is a function of `surgsim_apps.training.face_features` of one observation, so that a
+network can learn it (`agents/learn_palpate_organs.py`). The tip slides at a constant depth along rows of the face, less
+deep near the soft limit of force. After a clearly stiffer place, or the last row, it searches across the row there,
+goes to the stiffest place and declares it. Lengths are in tip radii and forces over the soft limit, so that the same
+numbers suit all organs.
 """
 
 import numpy as np
@@ -21,14 +21,14 @@ SLOW = 0.3  # [tip radii] below this distance speed is proportional to it
 DEPTH_SLOW = 0.2  # [tip radii] the same of depth
 START_NEAR = 0.6  # [tip radii] from the first row's start the tip descends
 DECLARE_NEAR = 0.2  # [tip radii] from the stiffest place it declares
-EXCESS = 0.5  # of a contrast over the median that is a lesion
-LAST = 0.12  # share of the time left at which the search is over
+EXCESS = 0.5  # least of a lesion: contrast over the median, less 1
+LAST = 0.12  # share of the time left at the end of the search
 
 
 def expert_actions(seen: FaceFeatures) -> torch.Tensor:
     """Actions (n, 4) for features: along the rows, then across them at the stiffest place, then there, and declare."""
-    found = (seen.excess > EXCESS) & (seen.passed > 0.5)
-    over = (seen.rows_left == 0.0) | found | ((seen.time_left < LAST) & (seen.begun > 0.5))
+    felt_lesion = (seen.excess > EXCESS) & (seen.passed > 0.5)
+    over = (seen.rows_left == 0.0) | felt_lesion | ((seen.time_left < LAST) & (seen.begun > 0.5))
     refining = over & (seen.across_left > 0.5)
     way = torch.where(over[:, None], seen.stiffest_way, seen.row_way)
     way = torch.where(refining[:, None], seen.across_way, way)
@@ -39,13 +39,13 @@ def expert_actions(seen: FaceFeatures) -> torch.Tensor:
 
 
 def blind_actions(seen: FaceFeatures, place: torch.Tensor) -> torch.Tensor:
-    """Actions (n, 4) of an agent that declares in the middle of the face, for features and places (n, 2)."""
+    """Actions (n, 4) for declaring in the middle of the face, for features and places (n, 2)."""
     distance = place.abs().amax(dim=1)
     return _actions(seen, -place, distance < START_NEAR, distance < DECLARE_NEAR)
 
 
 def _actions(seen: FaceFeatures, way: torch.Tensor, low: torch.Tensor, declare: torch.Tensor) -> torch.Tensor:
-    """Actions (n, 4) that go a way (n, 2) along the surface: in the tissue where `low` (n,), above it elsewhere."""
+    """Actions (n, 4) along the surface by a way (n, 2): in the tissue if `low` (n,), else above it."""
     sideways = (way / SLOW).clamp(-1.0, 1.0)
     wanted = torch.where(low, DEPTH, -GAP)
     rise = torch.maximum((seen.depth - wanted) / DEPTH_SLOW, FORCE_GAIN * (seen.force - FORCE_MOST)).clamp(-1.0, 1.0)

@@ -1,8 +1,8 @@
 """A scripted expert for SurgSim/Palpate-v0 with memory=True: slide over the face, go back to the stiffest, declare.
 
-It has no state: each action is a function of one observation. The tip slides along rows at a constant depth, less where
-the force nears the soft limit; the observation holds the measured contrast. After the rows it returns to the stiffest
-place and declares it.
+It has no state: each action is a function of one observation, which holds the measured contrast. The tip slides along
+rows at a constant depth, less near the soft limit of force. After the rows it returns to the stiffest place and
+declares it.
 """
 
 from typing import Any
@@ -49,7 +49,7 @@ class PalpateExpert:
             raise ValueError(f"this expert slides on a block's flat top; {scene.name!r} is not a block: use phantom")
         if task.memory is None:
             raise ValueError("this expert reads the memory of the observation: make the environment with memory=True")
-        self.env, self.slices = single, task.observation_slices
+        self.env, self.slices = single, single.observation_slices
         self.chart = task.memory.chart
         self.surface = scene.mesh.block.size[2] + scene.instrument.tip_radius
         self.force_most = FORCE_SHARE * scene.limits.soft_force

@@ -1,4 +1,4 @@
-"""Result files: one method on one environment, with what it takes to compare it with others."""
+"""Result files: one method on one environment, with everything for a comparison."""
 
 import json
 import math
@@ -8,7 +8,7 @@ from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from surgsim_env.palpation import ScoreEstimate
+from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_env.scene import STILL, agents_folder
 
 # JSON has no infinity.
@@ -26,15 +26,15 @@ class Result:
         seeds: of the episodes; in a file as text, "FIRST:LAST" or "A,B,C"
         budget: largest number of steps of an episode
         figures: by name, each a value with its interval
-        successes: whether each episode succeeded
-        command: that produced it
+        successes: success of each episode
+        command: the command line of the evaluation
         wall_time: of all episodes [s], on a machine with other load
         date: of its end
-        physics_version: that it was played with (`surgsim_env.scene.digest`)
+        physics_version: of the engine (`surgsim_env.scene.digest`)
         errors_mm: OSPA after each press of each episode (PalpateSites only)
         lesion_counts: lesions of each episode (PalpateSites only)
-        sees_truth: whether the method is declared to see what is hidden
-        own_estimate: whether its own estimate is scored in place of the common estimator's
+        sees_truth: True if the method declares that it sees hidden truth
+        own_estimate: True if its own estimate is scored instead of the common estimator's
     """
 
     method: str
@@ -55,7 +55,7 @@ class Result:
 
     @property
     def place(self) -> str:
-        """The key that groups tables: environment, scene, level, a split other than "test" and motion."""
+        """Key for grouping tables: environment, scene, level, a split other than "test" and motion."""
         level, split = self.env_kwargs.get("level") or "", self.env_kwargs.get("split") or ""
         name = self.env_id.removeprefix("SurgSim/").removesuffix("-v0")
         parts = [name, self.scene, level, "" if split == "test" else split, self.motion]
@@ -63,12 +63,12 @@ class Result:
 
     @property
     def scene(self) -> str:
-        """Name of the scene, also where it was given as a file; "" for the environment's own."""
+        """Name of the scene, without folder and ending of a file; "" for the environment's own."""
         return Path(self.env_kwargs.get("scene") or "").stem
 
     @property
     def motion(self) -> str:
-        """How the patient moves; "" for one who holds still."""
+        """The patient's motion; "" for a motionless one."""
         motion = self.env_kwargs.get("motion") or STILL
         return "" if motion == STILL else motion
 
@@ -95,7 +95,7 @@ def load_result(path: Path) -> Result:
     """Read a file of `Result.save`.
 
     Raises:
-        ValueError: another content (names the file and what is wrong).
+        ValueError: another content (names the file and the fault).
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -105,8 +105,8 @@ def load_result(path: Path) -> Result:
         }
         return Result(**{**table, "seeds": read_seeds(table["seeds"])})
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} is no result of surgsim evaluate: {type(error).__name__}: {said}") from None
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} is no result of surgsim evaluate: {type(error).__name__}: {reason}") from None
 
 
 def load_results(folder: Path) -> list[Result]:

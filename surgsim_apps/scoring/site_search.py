@@ -1,8 +1,7 @@
-"""The methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
+"""Methods for SurgSim/PalpateSites-v0 by name: site searches, and the reference scores, oracle and blind guess.
 
-Searches use observations and the size of the chart only (`SiteFacts`). Methods that see the truth declare it in
-`sees_truth`. A Gaussian process on log contrast is the belief
-of the searches `gp_*`.
+Searches use observations and the size of the chart only (`SiteFacts`). Methods with a view of the truth declare it in
+`sees_truth`. The belief of the searches `gp_*` is a Gaussian process on log contrast.
 """
 
 from collections.abc import Callable
@@ -13,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from surgsim_apps.scoring.figures import MapScore
 from surgsim_apps.training.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
-from surgsim_env.palpation import MapScore
 from surgsim_env.tasks import PalpateSitesTask
 
-# Parameters of GP-UCB and of the level-set search, chosen on organs that no evaluation uses (docs/palpation.md).
+# Parameters of GP-UCB and of the level-set search, chosen on organs outside all evaluations (docs/palpation.md).
 UCB_BETA = 3.0
 LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
 # The points of the face [m] (k, 3) at places of the chart (k, 2), each in [-1, 1].
@@ -25,14 +24,14 @@ Surface = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class RandomSites:
-    """Presses places that are uniformly distributed over the chart."""
+    """Presses at uniformly distributed places of the chart."""
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
         """Begin an episode."""
         self.rng = rng
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next."""
+        """The next press."""
         return self.rng.uniform(-1.0, 1.0, 2).astype(np.float32)
 
 
@@ -51,7 +50,7 @@ class RasterSites:
         self.count = 0
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next."""
+        """The next press."""
         self.count += 1
         return self.actions[(self.count - 1) % len(self.actions)].astype(np.float32)
 
@@ -74,17 +73,17 @@ class SobolSites:
         self.places = iter(qmc.Sobol(2, scramble=True, rng=rng).random_base2(powers))
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next."""
+        """The next press."""
         return (2.0 * next(self.places) - 1.0).astype(np.float32)
 
 
 class GpVariance:
-    """Variance reduction: presses the site of the largest standard deviation of the Gaussian process.
+    """Variance reduction: presses at the largest standard deviation of the Gaussian process.
 
     The deviation does not depend on the measured contrast: the presses fill the chart evenly, a raster of any length.
     """
 
-    # Whether the first presses are a raster (`SiteProcess.first`).
+    # True if the first presses are a raster (`SiteProcess.first`).
     begins_with_raster: ClassVar[bool] = False
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
@@ -92,7 +91,7 @@ class GpVariance:
         self.rng, self.process, self.count = rng, SiteProcess(facts), 0
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next."""
+        """The next press."""
         first = self.process.first(self.count) if self.begins_with_raster else None
         self.count += 1
         if first is not None:
@@ -105,7 +104,7 @@ class GpVariance:
 
 
 class GpUcb(GpVariance):
-    """GP-UCB (Srinivas et al. 2010): presses where mean + UCB_BETA x deviation of the excess is highest."""
+    """GP-UCB (Srinivas et al. 2010): presses at the largest mean + UCB_BETA x deviation of the excess."""
 
     begins_with_raster = True
 
@@ -115,39 +114,39 @@ class GpUcb(GpVariance):
 
 
 class GpLevelSet(GpVariance):
-    """Level-set search: presses where it is most uncertain whether there is a lesion.
+    """Level-set search: presses at the most ambiguous site between lesion and healthy tissue.
 
     Implicit level sets by upper confidence bounds, ILS-UCB (Garg et al. 2016, "Tumor localization using automated
     palpation with Gaussian process adaptive sampling"; Gotovos et al. 2013): the level h is a share of the largest
-    expected excess, and the site of the largest ambiguity min(upper bound - h, h - lower bound) is pressed: outlines of
+    expected excess, and the next press has the largest ambiguity min(upper bound - h, h - lower bound): outlines of
     lesions and unexplored regions.
     """
 
     begins_with_raster = True
 
     def worth(self, belief: Belief) -> NDArray[np.float64]:
-        """The ambiguity; the level is at least the least excess that the estimator reports as a lesion."""
+        """The ambiguity; the level is at least the estimator's least excess of a lesion."""
         excess, margin = belief.excess, LEVEL_BETA * belief.spread
         level = max(self.process.facts.excess_least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
         return np.minimum(excess + margin - level, level - excess + margin)
 
 
 class OracleSites(GpVariance):
-    """Presses where the process is least certain, and the true lesions last.
+    """Presses at the least certain sites, and the true lesions last.
 
-    It bounds what presses and the common estimator allow. Pressing around the lesions is worse: it leaves too few
-    presses elsewhere to tell the healthy tissue's background.
+    A bound for presses with the common estimator. Pressing around the lesions is worse: it leaves too few presses
+    elsewhere for the healthy tissue's background.
     """
 
     sees_truth: ClassVar[bool] = True
 
     def see(self, task: PalpateSitesTask) -> None:
-        """Take the truth of the episode that `reset` has begun."""
+        """Take the truth of the episode, after `reset`."""
         places = [task.charted.chart.place(point) for point in task.truth]
         self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next."""
+        """The next press."""
         left = self.process.facts.budget - self.count
         action = super().act(observation)
         return self.places[left - 1] if left <= len(self.places) else action
@@ -156,7 +155,7 @@ class OracleSites(GpVariance):
 class OracleNear(OracleSites):
     """Presses the true lesions first, then a place far from all of them, then around each, then as `OracleSites`.
 
-    A search has to find lesions before it can do so: it bounds how few presses locate them by the common estimator.
+    A bound for the presses that locate lesions by the common estimator: a search has to find them first.
     """
 
     # Directions around a lesion, and the distance over the lesions' mean radius.
@@ -164,7 +163,7 @@ class OracleNear(OracleSites):
     distance: ClassVar[float] = 0.9
 
     def see(self, task: PalpateSitesTask) -> None:
-        """Take the truth of the episode that `reset` has begun."""
+        """Take the truth of the episode, after `reset`."""
         super().see(task)
         facts = self.process.facts
         lesions = 0.5 * (np.array(self.places, dtype=np.float64).reshape(-1, 2) + 1.0) * facts.extent
@@ -174,7 +173,7 @@ class OracleNear(OracleSites):
         self.first_places = np.concatenate([lesions, far[None], *rings])
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next."""
+        """The next press."""
         if self.count < len(self.first_places):
             self.count += 1
             return self.process.facts.action(self.first_places[self.count - 1])
@@ -184,8 +183,8 @@ class OracleNear(OracleSites):
 class Middle:
     """The blind guess: one lesion in the middle of the chart, regardless of the presses.
 
-    It presses the middle too, as the environment asks for presses; `estimate` and `estimate_map` are scored in place of
-    the estimator's output.
+    It presses the middle too, since the environment asks for presses; `estimate` and `estimate_map` are scored instead
+    of the estimator's output.
     """
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
@@ -199,30 +198,30 @@ class Middle:
         """The middle of the chart on the surface [m], shape (1, 3)."""
         return surface(np.zeros((1, 2)))
 
-    def estimate_map(self, made: MapScore) -> MapScore:
+    def estimate_map(self, score: MapScore) -> MapScore:
         """A uniform map without an outline."""
-        return replace(made, excess=np.zeros_like(made.excess), outline=np.zeros_like(made.outline))
+        return replace(score, excess=np.zeros_like(score.excess), outline=np.zeros_like(score.outline))
 
 
 class TruthAgent(Middle):
-    """The oracle: estimates the true lesions, so that every place, map and outline scores 100 %."""
+    """The oracle: estimates the true lesions; every place, map and outline scores 100 %."""
 
     sees_truth: ClassVar[bool] = True
 
     def see(self, task: PalpateSitesTask) -> None:
-        """Take the truth of the episode that `reset` has begun."""
+        """Take the truth of the episode, after `reset`."""
         self.truth = task.truth
 
     def estimate(self, surface: Surface) -> NDArray[np.float64]:
         """Places of the lesions on the surface [m], shape (k, 3)."""
         return self.truth
 
-    def estimate_map(self, made: MapScore) -> MapScore:
+    def estimate_map(self, score: MapScore) -> MapScore:
         """The true map: 1 over lesions, else 0, and the true outline."""
-        return replace(made, excess=made.lesion.astype(np.float64), outline=made.outline_true)
+        return replace(score, excess=score.lesion.astype(np.float64), outline=score.outline_true)
 
 
-# Sides of the rasters tried on each scene; the leaderboard shows the best raster.
+# Sides of the rasters on each scene; the leaderboard shows the best raster.
 RASTER_SIDES = (2, 3, 4, 5, 6, 7)
 
 AGENTS: dict[str, Callable[[], SiteAgent]] = {
@@ -238,7 +237,7 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "middle": Middle,
 }
 
-# Methods whose estimates do not depend on what their presses feel.
+# Methods with estimates regardless of their presses.
 REFERENCES = ("truth", "middle")
-# Methods that know the truth, or do not search.
+# Methods with the truth, or without a search.
 BOUNDS = (*REFERENCES, "oracle", "oracle_near")

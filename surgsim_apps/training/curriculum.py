@@ -31,10 +31,10 @@ class StagedRewards(VecEnvWrapper):
 
     def __init__(self, envs: VecEnv, stage: Stage) -> None:
         super().__init__(envs)
-        task = envs.get_attr("unwrapped", indices=[0])[0].task
-        self.failure_terms = [f"reward_{one.name}" for one in task.rewards if one.per in ("failure", "step left")]
-        self.success_reward = sum(one.weight for one in task.rewards if one.per == "success")
-        self.visited: slice = task.observation_slices.get("visited", slice(0))
+        first = envs.get_attr("unwrapped", indices=[0])[0]
+        self.failure_terms = [f"reward_{one.name}" for one in first.task.rewards if one.per in ("failure", "step left")]
+        self.success_reward = sum(one.weight for one in first.task.rewards if one.per == "success")
+        self.visited: slice = first.observation_slices.get("visited", slice(0))
         self.stage = stage
         self._felt = np.zeros(envs.num_envs)
 

@@ -7,11 +7,11 @@ from torch import nn
 from torch.nn.functional import max_pool2d
 
 from surgsim_env.palpation import MAP_SIDE
-from surgsim_env.tasks import PalpateTask
+from surgsim_env.tasks import PalpateTask, channel_slices
 
 # Channels of the observation.
-FACE = PalpateTask.channel_slices(
-    contrast=MAP_SIDE**2, visited=MAP_SIDE**2, face=MAP_SIDE**2, stiffest=3, tip_place=3, tip_depth=1,
+FACE = channel_slices(
+    PalpateTask, contrast=MAP_SIDE**2, visited=MAP_SIDE**2, face=MAP_SIDE**2, stiffest=3, tip_place=3, tip_depth=1,
     surface_normal=3, face_force=3, map_cell=1, chart_share=2,
 )  # fmt: skip
 OBSERVATION_SIZE = max(part.stop for part in FACE.values())

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_env.palpation import Indenter
+from surgsim_env.tasks import ControlStep
 
 # Ranges that an episode draws: s, A, w over the lesion's radius, amplitude of g, and wavelength over the tip's radius.
 STIFFNESS, EXCESS, WIDTH, WAVE_MOST, WAVE_LENGTH = (1.2, 1.8), (0.35, 1.1), (0.6, 0.9), 0.12, (5.0, 15.0)
@@ -91,28 +92,21 @@ class FaceSurrogate:
         """One control step of the episodes that go on; returns observations (n_env, n_observation)."""
         for index in np.flatnonzero(~self.over):
             env, tip, action = self.envs[index], self.tips[index], np.asarray(actions[index], dtype=np.float64)
-            env.task.command(action, tip)
-            env.task.begin(action)
+            env.runtime.begin(action, tip)
             tip.tip_position = np.clip(
                 tip.tip_position + tip.tip_velocity * env.scene.timing.control_step, tip.lower, tip.upper
             )
             self._press(index)
             self._observations[index] = self._observe(index)
-            verdict = env.task.judge(tip, float(np.linalg.norm(tip.contact_force)), "")
+            verdict = env.runtime.judge(self._step(index))
             self.over[index] = verdict.terminated or verdict.truncated
             self.infos[index] = verdict.info
         return self._observations.copy()
 
     def _begun(self, env: Any) -> FormulaTip:
         """A tip where an episode begins, which is drawn without making its organ."""
-        task, rng = env.task, self.rng
-        if task.family is not None:
-            task.take_anatomy(task.family.draw(rng))
-        task.step_count, task.drawn = 0, task.draw_organ(rng)
-        for sensor in task.sensors.values():
-            sensor.reset(rng)
         instrument = env.simulation.instrument
-        start = np.asarray(task.draw(rng), dtype=np.float64)
+        start = np.asarray(env.runtime.draw(self.rng), dtype=np.float64)
         return FormulaTip(instrument.lower, instrument.upper, start, np.zeros(3), np.zeros(3))
 
     def _press(self, index: int) -> None:
@@ -130,4 +124,8 @@ class FaceSurrogate:
 
     def _observe(self, index: int) -> NDArray[np.float32]:
         env = self.envs[index]
-        return env.as_observed(env.task.observe(self.tips[index], self.rng)[0])
+        return env.as_observed(env.runtime.observe(self._step(index), self.rng)[0])
+
+    def _step(self, index: int) -> ControlStep:
+        tip: Any = self.tips[index]
+        return ControlStep(tip, float(np.linalg.norm(tip.contact_force)))

@@ -26,6 +26,7 @@ from surgsim_env.tasks import (
     SPEED_FULL_SCALE,
     START_GAP,
     PalpateTask,
+    reward_weights,
     touch_memory,
 )
 
@@ -141,7 +142,7 @@ class PalpateSurrogate(VectorEnv):
         self._remember(which, reading[:, 2])
         seen |= zip(("contrast", "visited", "stiffest"), self._recalled(), strict=True)
         seen["face"] = np.broadcast_to(self.map.pressable, seen["visited"].shape)
-        channels = self.task.observation_slices
+        channels = self.envs[0].observation_slices
         return self.envs[0].as_observed(np.concatenate([seen[name] for name in channels], axis=1))
 
     def _remember(self, which: NDArray[np.bool_], force: NDArray[np.float64]) -> None:
@@ -162,8 +163,8 @@ class PalpateSurrogate(VectorEnv):
     def _judge(
         self, force: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Callable[[int], dict[str, Any]]]:
-        """Rewards, ends and infos, as `PalpateTask.judge` has them."""
-        limits, weights = self.scene.limits, PalpateTask.weights
+        """Rewards, ends and infos, as `TaskRuntime.judge` has them."""
+        limits, weights = self.scene.limits, reward_weights(PalpateTask)
         hard = force > limits.hard_force
         declared = ~hard & (self.declared >= DECLARE_STEPS)
         error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)

@@ -58,7 +58,7 @@ class PolicyDescription:
     def home_scene(self) -> str:
         """Name of the scene that it was trained on."""
         task = TASKS.get(self.env_id.rpartition(":")[2])
-        return Path(self.env_kwargs.get("scene") or (task.default_scene if task else "")).stem
+        return Path(self.env_kwargs.get("scene") or (task.setup.scene if task else "")).stem
 
 
 def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
@@ -71,12 +71,12 @@ def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
     if not isinstance(task, Task):
         return None
     space = inner.observation_space
-    read, pictures = set(task.declared), {}
+    read, pictures = set(inner.layout.declared), {}
     if space.shape is None or len(space.shape) > 1:
         parts = space.spaces if isinstance(space, gym.spaces.Dict) else {"picture": space}
         read = {one.name for one in task.channels if one.felt and "force" in parts}
         pictures = {"picture": [list(parts["picture"].shape or ()), "uint8"]}
-    channels = {name: one for name, one in task.declared.items() if name in read}
+    channels = {name: one for name, one in inner.layout.declared.items() if name in read}
     return pictures | {
         name: [size, scale if getattr(inner, "scaled", True) else "SI"] for name, (size, scale) in channels.items()
     }

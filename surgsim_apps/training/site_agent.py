@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul
 from surgsim_env.palpation import BACKGROUND_SPREAD, EXCESS_SPREAD, MAP_SIDE, TouchMap, contrast_process
-from surgsim_env.tasks import PalpateSitesTask
+from surgsim_env.tasks import PalpateSitesTask, channel_slices
 
 # Sites nearer to the chart's border than this share of its side are not pressed: half of the area that a press there
 # informs about can hold no lesion.
@@ -25,7 +25,8 @@ FIRST_LENGTHS = 6.0
 
 SITE_COUNT = MAP_SIDE * MAP_SIDE
 # Entries of the observation with memory, by channel.
-SLICES = PalpateSitesTask.channel_slices(
+SLICES = channel_slices(
+    PalpateSitesTask,
     **dict.fromkeys(("contrast_map", "pressed_map", "face_map"), SITE_COUNT),
     map_cell=1,
     chart_share=2,

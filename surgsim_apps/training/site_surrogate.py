@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from surgsim_apps.training.site_agent import OBSERVATION_SIZE, SLICES
 from surgsim_env.palpation import FOUND_SHARE, MAP_SIDE, LesionEstimator, TouchMap, ospa, ospa_cutoff
 from surgsim_env.scene import REFERENCE_TIP
-from surgsim_env.tasks import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
+from surgsim_env.tasks import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask, reward_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.memory[SLICES["presses_left"]] = 1.0 - len(self.sites) / self.budget
         found_before = self.found
         self.error, self.found = self._judged()
-        weights = PalpateSitesTask.weights
+        weights = reward_weights(PalpateSitesTask)
         reward = weights["error"] * self.error / self.cutoff / self.budget
         reward += weights["found"] * (self.found - found_before)
         over = len(self.sites) >= self.budget

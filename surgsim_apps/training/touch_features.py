@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from surgsim_env.palpation import MAP_CELL, MAP_SIDE
-from surgsim_env.tasks import LENGTH_SCALE, PalpateTask
+from surgsim_env.tasks import LENGTH_SCALE, PalpateTask, channel_slices
 
 # Radius of the blocks' tip [m].
 TIP_RADIUS = 0.008
@@ -13,7 +13,8 @@ SEARCH_REACH = 0.8
 # A press is about a quarter of the soft limit, and a lesion about a quarter stiffer than the tissue around it.
 GAIN = 4.0
 # Channels of the observation in frame="world", in which those of frame="face" have no entry.
-CHANNELS = PalpateTask.channel_slices(
+CHANNELS = channel_slices(
+    PalpateTask,
     **dict.fromkeys(("tip_place", "tip_depth", "surface_normal", "face_force", "map_cell", "chart_share"), 0),
     **dict.fromkeys(("contrast", "visited", "face"), MAP_SIDE**2),
     stiffest=3,

@@ -1,1 +1,1 @@
-"""`surgsim validate`: how far the tissue is from the solid asked for, case by case, against independent references."""
+"""Validation of the tissue against independent references, case by case: `surgsim validate`."""

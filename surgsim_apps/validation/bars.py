@@ -1,4 +1,4 @@
-"""Bars of the lattice against closed forms and hexahedra, with springs of formula (6) and with fitted ones.
+"""Bars of the lattice against closed forms and hexahedra, with springs of formula (6) and fitted springs.
 
 The 2 x 5 x 10 cm prism of the paper's test A is pulled, and twisted with its ends held. A 2 x 2 x 10 cm beam held at
 one end bends under a force, swings, and vibrates along its length.
@@ -24,6 +24,7 @@ from surgsim_apps.validation.statics import (
     assemble_stiffness,
     linear_organ,
     nodal_dofs,
+    nodes_at,
     pull_stiffness,
     solve_displacement,
     twice_energy,
@@ -33,7 +34,7 @@ from surgsim_apps.validation.statics import (
 MODULUS = 20e3  # [Pa]
 PRISM, BEAM = (0.02, 0.05, 0.10), (0.02, 0.02, 0.10)  # [m]
 HEXAHEDRA = "scikit-fem, quadratic hexahedra"
-# Cells along the thickness of 2 cm, their edges [m], and what facts section 7 gives: tension, torsion by formula (6).
+# Cells along the thickness of 2 cm, their edges [m], and tolerances of formula (6) by facts, section 7.
 CELLS = (2, 4, 6)
 SIZES = [PRISM[0] / across for across in CELLS]
 TENSION_TOLERANCE = (0.15, 0.07, 0.07)
@@ -47,7 +48,7 @@ FITTED_TORSION_TOLERANCE = 0.20
 # with the tolerance of those.
 GRADED_ACROSS = 4
 
-# Facts, section 7, gives those of formula (6); fitted springs do better.
+# Of formula (6) by facts, section 7; fitted springs do better.
 FREQUENCY_TOLERANCE = {"lloyd": (0.25, 0.12, 0.08), "fitted": (0.20, 0.08, 0.05)}
 ROD_TOLERANCE = {"lloyd": 0.08, "fitted": 0.03}
 SPRINGS = {"lloyd": "", "fitted": ", fitted springs"}
@@ -56,13 +57,13 @@ ALPHA = 4.0 * math.pi  # [1/s] ratio 0.1 at 10 Hz
 
 
 def cell_name(across: int) -> str:
-    """The cell in the names of rows, with `across` cells across the thickness."""
+    """Name of the cell in rows, with `across` cells across the thickness."""
     return f"cell {1e3 * PRISM[0] / across:.1f} mm"
 
 
 @lru_cache(maxsize=4)
 def prism_mesh(across: int) -> TetMesh:
-    """The prism with `across` cubic cells across its thickness."""
+    """Prism with `across` cubic cells across its thickness."""
     return box_mesh(PRISM, np.array((2, 5, 10)) * across // 2)
 
 
@@ -74,9 +75,8 @@ def prism(across: int, rule: str = "lloyd", nu: float = 0.25) -> tuple[TetMesh, 
 
 
 def torsion_stiffness(mesh: TetMesh, stiffness: csr_array) -> float:
-    """Torque per angle of a prism with both ends held as rigid plates [N m/rad]."""
-    place = mesh.points[:, 2]
-    low, high = np.flatnonzero(place < 1e-9), np.flatnonzero(place > PRISM[2] - 1e-9)
+    """Torque per angle of a prism with ends held as rigid plates [N m/rad]."""
+    low, high = (nodes_at(mesh.points, height) for height in (0.0, PRISM[2]))
     arm = mesh.points[high] - 0.5 * np.array(PRISM)
     turn = np.stack([-arm[:, 1], arm[:, 0], np.zeros(len(high))], axis=1)
     value = np.concatenate([np.zeros(3 * len(low)), turn.ravel()])
@@ -158,11 +158,10 @@ def graded_prism() -> Iterator[Row]:
 
 
 def beam(across: int, alpha: float = 0.0, rule: str = "lloyd") -> tuple[TetMesh, OrganModel]:
-    """The beam with `across` cells across, its root z = 0 held."""
+    """Beam with `across` cells across, its root z = 0 held."""
     mesh = box_mesh(BEAM, np.array((2, 2, 10)) * across // 2)
-    root = np.flatnonzero(mesh.points[:, 2] < 1e-9)
+    root, damping = nodes_at(mesh.points, 0.0), Damping(alpha=alpha)
     material = Material(MODULUS, DENSITY)
-    damping = Damping(alpha=alpha)
     return mesh, compile_organ(OrganSpec(mesh, material, anchors=root, damping=damping, stiffness_rule=rule))
 
 
@@ -186,24 +185,26 @@ def cantilever_case(rule: str = "lloyd") -> Iterator[Result]:
     frequencies: list[Row] = []
     for across, tolerance in zip(CELLS, FREQUENCY_TOLERANCE[rule], strict=True):
         mesh, model = beam(across, rule=rule)
-        shape, found = bent(mesh, model)
+        shape, measured = bent(mesh, model)
         name = f"{cell_name(across)}{SPRINGS[rule]}"
         deflection = compare(
-            f"cantilever, deflection per newton, {name}", HEXAHEDRA, expected=compliance, measured=found,
+            f"cantilever, deflection per newton, {name}", HEXAHEDRA, expected=compliance, measured=measured,
             # Stiffness goes with the square of the frequency.
             tolerance=1.0 - (1.0 + tolerance) ** -2, unit="m/N",
         )  # fmt: skip
         deflections.append(deflection)
         time, value = released(model, shape * (1e-4 / np.abs(shape).max()), 2.0 / frequency)
-        found = fitted_oscillation(time, value)[0]
-        name = f"cantilever, first frequency, {name}"
-        frequencies.append(compare(name, HEXAHEDRA, expected=frequency, measured=found, tolerance=tolerance, unit="Hz"))
+        row = compare(
+            f"cantilever, first frequency, {name}", HEXAHEDRA, expected=frequency,
+            measured=fitted_oscillation(time, value)[0], tolerance=tolerance, unit="Hz",
+        )  # fmt: skip
+        frequencies.append(row)
     yield from with_order(f"cantilever, deflection{SPRINGS[rule]}", SIZES, deflections)
     yield from with_order(f"cantilever, frequency{SPRINGS[rule]}", SIZES, frequencies)
 
 
 def stretched(mesh: TetMesh) -> FloatArray:
-    """The rod's first mode along its length, 10 um at the end: u_z = U sin(pi z / 2 L), thinner as it is longer."""
+    """First mode along the rod, 10 um at the end: u_z = U sin(pi z / 2 L), with its thinning by nu 1/4."""
     x, y, z = (mesh.points - 0.5 * np.array([BEAM[0], BEAM[1], 0.0])).T
     wave = 0.5 * np.pi / BEAM[2]
     strain = wave * np.cos(wave * z) * (z > 1e-9)
@@ -211,20 +212,20 @@ def stretched(mesh: TetMesh) -> FloatArray:
 
 
 def rod_case(rule: str = "lloyd") -> Iterator[Result]:
-    """The first frequency along the rod, sqrt(E / rho) / (4 L) = 10.86 Hz."""
+    """First frequency along the rod, sqrt(E / rho) / (4 L) = 10.86 Hz."""
     expected = math.sqrt(MODULUS / DENSITY) / (4.0 * BEAM[2])
     rows: list[Row] = []
     for across in CELLS:
         mesh, model = beam(across, rule=rule)
-        found, _ = fitted_oscillation(*released(model, stretched(mesh), 3.0 / expected))
+        measured, _ = fitted_oscillation(*released(model, stretched(mesh), 3.0 / expected))
         name, law = f"fixed-free rod, frequency, {cell_name(across)}{SPRINGS[rule]}", "sqrt(E / rho) / (4 L)"
-        rows.append(compare(name, law, expected=expected, measured=found, tolerance=ROD_TOLERANCE[rule], unit="Hz"))
+        rows.append(compare(name, law, expected=expected, measured=measured, tolerance=ROD_TOLERANCE[rule], unit="Hz"))
     # The error of fitted springs has another sign and origin; it need not fall with the cell size.
     yield from with_order("rod, frequency", SIZES, rows) if rule == "lloyd" else rows
 
 
 def damping_case() -> Iterator[Row]:
-    """Amplitudes fall by exp(-alpha t / 2), whatever the mode."""
+    """Amplitudes fall by exp(-alpha t / 2) in every mode."""
     mesh, model = beam(2, ALPHA)
     for name, shape, duration in (("along", stretched(mesh), 0.4), ("swinging", bent(mesh, model)[0], 1.5)):
         start = shape * (1e-5 / np.abs(shape).max())

@@ -1,7 +1,7 @@
-"""The capsule: a membrane that no mesh makes stiffer, beside the paper's layer of tets, which grows with the cell.
+"""Capsules: a membrane independent of the mesh, beside the paper's layer of tets, which grows with the cell.
 
-The membrane's E_c h_c is measured of its springs alone as a sheet, with nodes free to move along the surface, and of an
-organ: a pulled block is stiffer by its capsule, whichever rule makes it.
+The membrane's E_c h_c is measured on its springs alone as a sheet, with nodes free to move along the surface, and on an
+organ: the capsule stiffens a pulled block.
 """
 
 from collections.abc import Iterator
@@ -19,8 +19,8 @@ from surgsim_apps.validation.statics import (
     DENSITY,
     assemble_stiffness,
     nodal_dofs,
-    outer_products,
     solve_displacement,
+    spring_matrix,
     vector_areas,
 )
 from surgsim_env.scene import load_anatomy, make_scene
@@ -57,10 +57,10 @@ def faces() -> Iterator[Row]:
         mesh = box_mesh((SIZE,) * 3, (cells,) * 3)
         top = (mesh.points[mesh.boundary_triangles, 2] > SIZE - 1e-9).all(axis=1)
         equibiaxial, directions = patch_stiffness(mesh, mesh.boundary_triangles[top])
-        found = np.append(directions, equibiaxial)
+        values = np.append(directions, equibiaxial)
         yield compare(
             f"membrane capsule on a block's face, cell {1e3 * SIZE / cells:.1f} mm", "E_c h_c", expected=STIFFNESS,
-            measured=float(found[np.argmax(np.abs(found - STIFFNESS))]), tolerance=FACE_TOLERANCE, unit="N/m",
+            measured=float(values[np.argmax(np.abs(values - STIFFNESS))]), tolerance=FACE_TOLERANCE, unit="N/m",
             note="the worst of equibiaxial and 12 directions",
         )  # fmt: skip
 
@@ -91,8 +91,8 @@ def _spread(mesh: TetMesh) -> str:
     """Stiffness of patches of a surface along one direction, over E_c h_c, as text."""
     area = np.linalg.norm(vector_areas(mesh.points, mesh.boundary_triangles), axis=1)
     chosen = np.random.default_rng(0).choice(len(area), PATCH_COUNT, replace=False, p=area / area.sum())
-    found = [patch_stiffness(mesh, patch_around(mesh.boundary_triangles, one)) for one in chosen.tolist()]
-    directions = np.concatenate([one[1] for one in found]) / STIFFNESS
+    patches = [patch_around(mesh.boundary_triangles, triangle) for triangle in chosen.tolist()]
+    directions = np.concatenate([patch_stiffness(mesh, patch)[1] for patch in patches]) / STIFFNESS
     low, high = np.quantile(directions, (0.05, 0.95))
     return (
         f"12 directions in {PATCH_COUNT} patches of some 80 triangles: {directions.mean():.2f} E_c h_c on average, "
@@ -101,7 +101,7 @@ def _spread(mesh: TetMesh) -> str:
 
 
 def pulled() -> Iterator[Result]:
-    """Stiffness that each rule adds to a pulled block, as a membrane stiffness, at three cell sizes."""
+    """Membrane stiffness of each rule's capsule on a pulled block, at three cell sizes."""
     sizes = [SIZE / cells for cells in CELLS]
     meshes = [box_mesh((SIZE,) * 3, (cells,) * 3) for cells in CELLS]
     by_hand = [(STROMA - TISSUE) * size * SHARE_OF_LAYER / SHARE_OF_SHEET for size in sizes]
@@ -110,16 +110,16 @@ def pulled() -> Iterator[Result]:
         ("the paper's layer", Capsule(STROMA), "formula (6) on two tets a square of the face, by hand", by_hand,
          LAYER_TOLERANCE),
     ):  # fmt: skip
-        found = [added_stiffness(mesh, capsule) for mesh in meshes]
-        for size, one, measured in zip(sizes, expected, found, strict=True):
+        stiffness = [added_stiffness(mesh, capsule) for mesh in meshes]
+        for size, reference, measured in zip(sizes, expected, stiffness, strict=True):
             yield compare(
-                f"capsule of a pulled block, {rule}, cell {1e3 * size:.1f} mm", law, expected=one, measured=measured,
-                tolerance=tolerance, unit="N/m",
+                f"capsule of a pulled block, {rule}, cell {1e3 * size:.1f} mm", law, expected=reference,
+                measured=measured, tolerance=tolerance, unit="N/m",
             )  # fmt: skip
-        for label, values in ((f"capsule by {rule}", found), (f"reference, {rule}", expected)):
+        for label, values in ((f"capsule by {rule}", stiffness), (f"reference, {rule}", expected)):
             labels = ("cell [mm]", "membrane stiffness [N/m]", False)
             yield Curve("capsule", label, tuple(1e3 * size for size in sizes), tuple(values), *labels)
-    # The paper's layer is the tets with a face on the boundary: its thickness in cells.
+    # The paper's layer consists of the tets with a face on the boundary: its thickness in cells.
     mesh, area = meshes[0], 6.0 * SIZE**2
     touching = np.isin(mesh.tets, mesh.boundary_nodes).any(axis=1)
     thickness = float(mesh.volumes[boundary_layer(mesh)].sum()) / area
@@ -132,22 +132,24 @@ def pulled() -> Iterator[Result]:
 
 
 def added_stiffness(mesh: TetMesh, capsule: Capsule) -> float:
-    """The E h of the sheet that would stiffen the pulled block as much as the capsule does [N/m]."""
-    with_it, without = (
-        uniaxial_modulus(mesh, assemble_stiffness(compile_organ(OrganSpec(mesh, Material(TISSUE, DENSITY), one))))
-        for one in (capsule, None)
+    """E h of a sheet that stiffens the pulled block as the capsule does [N/m]."""
+    covered, bare = (
+        uniaxial_modulus(mesh, assemble_stiffness(compile_organ(OrganSpec(mesh, Material(TISSUE, DENSITY), cover))))
+        for cover in (capsule, None)
     )
-    return (with_it - without) * SIZE**2 / (4.0 * SIZE) / SHARE_OF_SHEET
+    return (covered - bare) * SIZE**2 / (4.0 * SIZE) / SHARE_OF_SHEET
 
 
 def inflated(mesh: TetMesh) -> float:
-    """E_c h_c of a whole surface by u = e x, which is equibiaxial everywhere [N/m].
+    """E_c h_c of a whole surface by the equibiaxial strain of u = e x [N/m].
 
-    A sheet does not slide along the surface then, because its tension is uniform; springs may.
+    A sheet of uniform tension does not slide along the surface; springs may.
     """
     points = mesh.points
-    matrix = _membrane_matrix(mesh)
     nodes = mesh.boundary_nodes
+    stiffness = membrane_stiffness(mesh, MODULUS, THICKNESS)
+    springs = np.flatnonzero(stiffness > 0.0)
+    matrix = spring_matrix(points, mesh.edges[springs], stiffness[springs])
     rows = nodal_dofs(nodes)
     vector_area = vector_areas(points, mesh.boundary_triangles)
     normal = np.zeros_like(points)
@@ -162,9 +164,9 @@ def inflated(mesh: TetMesh) -> float:
 
 
 def patch_stiffness(mesh: TetMesh, triangles: IntArray) -> tuple[float, FloatArray]:
-    """E_c h_c of some boundary triangles (n, 3): equibiaxial, and along DIRECTIONS directions [N/m].
+    """E_c h_c of a patch of boundary triangles (n, 3): equibiaxial, and along DIRECTIONS directions [N/m].
 
-    The patch is laid flat, its rim held in the strain; springs on the rim belong to it by half.
+    The patch is laid flat, its rim strained; springs on the rim count by half.
     """
     vector_area = vector_areas(mesh.points, triangles)
     plane = tangents(vector_area.sum(axis=0)[None])[0]
@@ -177,7 +179,7 @@ def patch_stiffness(mesh: TetMesh, triangles: IntArray) -> tuple[float, FloatArr
     along /= np.linalg.norm(along, axis=1)[:, None]
     span = along * np.linalg.norm(step, axis=1)[:, None]
     stiffness = _springs_of(mesh, edges) * np.where(uses == 1, 0.5, 1.0)
-    # Stretch of each spring per displacement in the plane, and those of the nodes that may move.
+    # Stretch of each spring per displacement in the plane; nodes inside the rim move.
     stretch = np.zeros((len(edges), len(nodes), 2))
     for side, sign in ((0, -1.0), (1, 1.0)):
         stretch[np.arange(len(edges)), ends[:, side]] += sign * along
@@ -185,16 +187,16 @@ def patch_stiffness(mesh: TetMesh, triangles: IntArray) -> tuple[float, FloatArr
     moved = stretch[:, free].reshape(len(edges), -1) * np.sqrt(stiffness)[:, None]
     turn = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     strains = [np.eye(2), *(np.outer(v, v) for v in np.stack([np.cos(turn), np.sin(turn)], axis=1))]
-    # The stretches of the affine strain that remain after the free nodes have relaxed (least squares).
-    wanted = np.stack([np.einsum("ei,ij,ej->e", along, strain, span) for strain in strains], axis=1)
-    wanted *= np.sqrt(stiffness)[:, None]
-    left = wanted - moved @ np.linalg.lstsq(moved, wanted, rcond=None)[0]
-    twice = (left**2).sum(axis=0) / float(np.linalg.norm(vector_area, axis=1).sum())
+    # Stretches of the affine strain after the free nodes have relaxed (least squares).
+    affine = np.stack([np.einsum("ei,ij,ej->e", along, strain, span) for strain in strains], axis=1)
+    affine *= np.sqrt(stiffness)[:, None]
+    relaxed = affine - moved @ np.linalg.lstsq(moved, affine, rcond=None)[0]
+    twice = (relaxed**2).sum(axis=0) / float(np.linalg.norm(vector_area, axis=1).sum())
     return float(twice[0] / TWICE_ENERGY["equibiaxial"]), twice[1:] / TWICE_ENERGY["along one direction"]
 
 
 def patch_around(triangles: IntArray, middle: int) -> IntArray:
-    """PATCH_RINGS rings of triangles around one of them, about 40 with it (n, 3)."""
+    """Triangle and PATCH_RINGS rings of triangles around it (n, 3)."""
     chosen = triangles[[middle]]
     for _ in range(PATCH_RINGS):
         chosen = triangles[np.isin(triangles, chosen).any(axis=1)]
@@ -202,18 +204,8 @@ def patch_around(triangles: IntArray, middle: int) -> IntArray:
 
 
 def tangents(normal: FloatArray) -> FloatArray:
-    """Two unit vectors across each normal (n, 3), as columns (n, 3, 2)."""
+    """Pairs of unit vectors across normals (n, 3), as columns (n, 3, 2)."""
     return np.linalg.svd(normal[:, None, :])[2][:, 1:].transpose(0, 2, 1)
-
-
-def _membrane_matrix(mesh: TetMesh) -> csr_array:
-    stiffness = membrane_stiffness(mesh, MODULUS, THICKNESS)
-    springs = np.flatnonzero(stiffness > 0.0)
-    edges = mesh.edges[springs]
-    span = mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]]
-    along = span / np.linalg.norm(span, axis=1)[:, None]
-    vectors = np.concatenate([-along, along], axis=1) * np.sqrt(stiffness[springs])[:, None]
-    return outer_products(edges, vectors, mesh.points.size)
 
 
 def _springs_of(mesh: TetMesh, edges: IntArray) -> FloatArray:

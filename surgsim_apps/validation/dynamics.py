@@ -1,7 +1,7 @@
-"""Motion: frequency and decay of free motion, the stable step, energy over ten seconds, passivity of organ and tool.
+"""Motion: frequency and decay of free motion, stable step, energy over ten seconds, passivity of organ and tool.
 
-For passivity a free ball in MuJoCo and a small organ exchange forces as a scene does; the energy of both is followed
-through bounces without losses, and the tool's work through many presses.
+For passivity a free ball in MuJoCo and a small organ exchange forces as in a scene: energy of both in bounces without
+losses, and work of the tool in many presses.
 """
 
 import math
@@ -33,13 +33,13 @@ from msdm_core.organ import (
     stable_dt,
 )
 from surgsim_apps.validation.row import Curve, Result, Row, compare
-from surgsim_apps.validation.statics import DENSITY, assemble_stiffness
+from surgsim_apps.validation.statics import DENSITY, assemble_stiffness, nodes_at
 from surgsim_env.coupling import haptic_steps, runs_compiled
 from surgsim_env.instruments import ToolBodies
 from surgsim_env.scene import substeps_needed
 
 SAMPLES = 400  # of a free motion
-STIFFER = 20e3  # [Pa] of the organs whose stable step is measured
+STIFFER = 20e3  # [Pa] of the organs for the stable step
 STEP_COUNT = 2000
 START = 1e-9  # [m]
 HAPTIC_STEP = 1e-3  # [s]
@@ -47,16 +47,16 @@ GRAVITY = 9.81  # [m/s^2], on the tool alone
 BLOCK = (0.03, 0.03, 0.02)  # [m]
 CELLS = (6, 6, 4)
 MODULUS = 15e3  # [Pa]
-# A scene's contact with nothing that takes energy.
+# A scene's contact without losses.
 ELASTIC = ContactLaw(stiffness=2e7, damping=0.0, friction=0.0, tangential_stiffness=1e7)
 
-# Passivity: radius of the bouncing ball [m], haptic steps of a mean, the losses of a scene, and its alpha [1/s].
+# Passivity: radius of the bouncing ball [m], haptic steps of a mean, losses of a scene, and its alpha [1/s].
 RADIUS = 0.010
 WINDOW = 100
 LOSSY = ContactLaw(stiffness=2e7, damping=100.0, friction=0.2, tangential_stiffness=1e7)
 ALPHA = 25.0
-# Mass [kg] and height [m]. After a low fall little energy is lost before vibrating tissue under the resting ball could
-# gain some; after a high fall the ball bounces.
+# Mass [kg] and height [m]. A low fall leaves energy for vibrations of tissue under the resting ball; after a high fall
+# the ball bounces.
 OTHER_FALLS = ((0.005, 0.005), (0.02, 0.0005), (0.02, 0.005), (0.1, 0.0005), (0.1, 0.005))
 
 BALL = """
@@ -74,18 +74,18 @@ BALL = """
 </mujoco>
 """
 FREE = "<freejoint/>"
-# A heavy ball rolls off a soft block: this one goes straight up and down above it.
+# A heavy ball would roll off a soft block: it moves straight up and down.
 UPRIGHT = '<joint type="slide" axis="0 0 1"/>'
 
 
 def released(
     model: OrganModel, displacement: FloatArray, duration: float, *, step_share: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Release an organ from a small displacement and follow its part along that shape, u0 . M u(t).
+    """Free motion of an organ from a small displacement, as its part along that shape, u0 . M u(t).
 
     Args:
         model: the organ.
-        displacement: the shape it is released from [m], shape (n_node, 3).
+        displacement: at the release [m], shape (n_node, 3).
         duration: [s].
         step_share: of the organ's stable step.
 
@@ -100,18 +100,18 @@ def released(
 
     state = rest_state(model)
     state.node_position[:] += displacement
-    every = max(1, round(duration / SAMPLES / (step_share * model.stable_step)))
-    dt = duration / SAMPLES / every
-    return dt * every * np.arange(SAMPLES + 1, dtype=np.float64), followed(model, state, dt, every, SAMPLES, part)
+    steps = max(1, round(duration / SAMPLES / (step_share * model.stable_step)))
+    dt = duration / SAMPLES / steps
+    return dt * steps * np.arange(SAMPLES + 1, dtype=np.float64), followed(model, state, dt, steps, SAMPLES, part)
 
 
 def followed(
-    model: OrganModel, state: OrganState, dt: float, every: int, count: int, measure: Callable[[OrganState], float]
+    model: OrganModel, state: OrganState, dt: float, steps: int, count: int, measure: Callable[[OrganState], float]
 ) -> FloatArray:
-    """A measure of the state at the start and after each of `count` runs of `every` steps of dt [s]."""
+    """Measure of the state at the start and after each of `count` runs of `steps` steps of dt [s]."""
     values = [measure(state)]
     for _ in range(count):
-        advance_or_raise(model, state, dt, every)
+        advance_or_raise(model, state, dt, steps)
         values.append(measure(state))
     return np.array(values)
 
@@ -124,27 +124,26 @@ def fitted_oscillation(time: FloatArray, value: FloatArray) -> tuple[float, floa
     def damped(t: FloatArray, size: float, frequency: float, rate: float, phase: float) -> FloatArray:
         return size * np.exp(-rate * t) * np.cos(2.0 * np.pi * frequency * t + phase)
 
-    found, _ = curve_fit(damped, time, value, p0=(value[0], start, 0.0, 0.0))
-    return float(found[1]), float(found[2])
+    (_, frequency, rate, _), _ = curve_fit(damped, time, value, p0=(value[0], start, 0.0, 0.0))
+    return float(frequency), float(rate)
 
 
 def organs() -> dict[str, OrganModel]:
-    """A plain block, a nearly incompressible one, and one with capsule, lesion and held nodes."""
+    """Blocks: plain, nearly incompressible, and with capsule, lesion and held nodes."""
     mesh = box_mesh((0.04, 0.04, 0.04), (4, 4, 4))
-    still = Damping(alpha=0.0)
-    held = np.flatnonzero(mesh.points[:, 2] < 1e-9)
+    undamped, held = Damping(alpha=0.0), nodes_at(mesh.points, 0.0)
     soft, lesion = Material(STIFFER, DENSITY, 0.45), Lesion((0.02, 0.02, 0.02), 0.012, Material(8 * STIFFER, DENSITY))
     return {
-        "springs": compile_organ(OrganSpec(mesh, Material(STIFFER, DENSITY), damping=still)),
-        "nu 0.45": compile_organ(OrganSpec(mesh, soft, damping=still)),
+        "springs": compile_organ(OrganSpec(mesh, Material(STIFFER, DENSITY), damping=undamped)),
+        "nu 0.45": compile_organ(OrganSpec(mesh, soft, damping=undamped)),
         "capsule and lesion": compile_organ(
-            OrganSpec(mesh, soft, Capsule(60e3), lesions=(lesion,), anchors=held, damping=still)
+            OrganSpec(mesh, soft, Capsule(60e3), lesions=(lesion,), anchors=held, damping=undamped)
         ),
     }
 
 
 def fastest_mode(model: OrganModel) -> tuple[float, FloatArray]:
-    """omega_max [rad/s] and its shape, largest part 1, by Lanczos to rounding."""
+    """omega_max [rad/s] and its shape, with a largest part of 1, by Lanczos to rounding."""
     root = np.repeat(np.sqrt(model.node_inverse_mass), 3)
     matrix = diags_array(root) @ assemble_stiffness(model) @ diags_array(root)
     start = np.sin(1.0 + 1.7 * np.arange(len(root)) ** 1.1)
@@ -154,7 +153,7 @@ def fastest_mode(model: OrganModel) -> tuple[float, FloatArray]:
 
 
 def largest_growth(model: OrganModel, shape: FloatArray, dt: float, count: int) -> float:
-    """Largest displacement over that at the start in `count` steps from the fastest mode."""
+    """Largest displacement over the initial one in `count` steps from the fastest mode."""
     state = rest_state(model)
     state.node_position[:] += START * shape
     largest = 1.0
@@ -168,24 +167,24 @@ def largest_growth(model: OrganModel, shape: FloatArray, dt: float, count: int) 
 
 
 def stable_step() -> Iterator[Row]:
-    """Stable at 0.95 and unstable at 1.1 of the true limit; the limit that this package uses lies just below it."""
+    """Stable at 0.95 and unstable at 1.1 of the true limit, and this package's limit, just below it."""
     for name, model in organs().items():
         omega, shape = fastest_mode(model)
         limit = 2.0 / omega
         # At 0.95 of it the mode's amplitude is at most 1 / sqrt(1 - 0.95^2) = 3.2; at 1.1 it grows 2.43 x a step.
-        calm = largest_growth(model, shape, 0.95 * limit, STEP_COUNT)
-        wild = largest_growth(model, shape, 1.10 * limit, STEP_COUNT)
+        stable = largest_growth(model, shape, 0.95 * limit, STEP_COUNT)
+        unstable = largest_growth(model, shape, 1.10 * limit, STEP_COUNT)
         yield compare(
             f"stable step, {name}", "2 / omega_max of the assembled matrix", expected=limit,
             measured=stable_dt(model), tolerance=0.01, unit="s", note="the value that this package uses",
         )  # fmt: skip
         yield compare(
-            f"stable at 0.95, {name}", "|z| = 1", expected=1.0, measured=float(calm < 10.0), tolerance=0.0,
-            note=f"grew x {calm:.3g} in {STEP_COUNT} steps",
+            f"stable at 0.95, {name}", "|z| = 1", expected=1.0, measured=float(stable < 10.0), tolerance=0.0,
+            note=f"grew x {stable:.3g} in {STEP_COUNT} steps",
         )  # fmt: skip
         yield compare(
-            f"unstable at 1.1, {name}", "|z| = 2.43", expected=1.0, measured=float(wild > 1e3), tolerance=0.0,
-            note=f"grew x {wild:.3g} or more",
+            f"unstable at 1.1, {name}", "|z| = 2.43", expected=1.0, measured=float(unstable > 1e3), tolerance=0.0,
+            note=f"grew x {unstable:.3g} or more",
         )  # fmt: skip
 
 
@@ -198,7 +197,7 @@ def energy_drift() -> Iterator[Row]:
     dt = 0.5 * model.stable_step
     energy = followed(
         model, state, dt, 7, math.ceil(10.0 / dt) // 7,
-        lambda now: kinetic_energy(model, now) + potential_energy(model, now),
+        lambda state: kinetic_energy(model, state) + potential_energy(model, state),
     )  # fmt: skip
     tenth = len(energy) // 10
     measured = float(energy[-tenth:].mean() / energy[:tenth].mean())
@@ -206,14 +205,14 @@ def energy_drift() -> Iterator[Row]:
 
 
 def small_block(damping: Damping) -> OrganModel:
-    """30 x 30 x 20 mm of 5 mm cells, bonded below."""
+    """Block of 30 x 30 x 20 mm with 5 mm cells, bonded below."""
     mesh = box_mesh(BLOCK, CELLS)
-    held = np.flatnonzero(mesh.points[:, 2] < 1e-9)
-    return compile_organ(OrganSpec(mesh, Material(MODULUS, 1060.0, 0.45), anchors=held, damping=damping))
+    material, floor = Material(MODULUS, 1060.0, 0.45), nodes_at(mesh.points, 0.0)
+    return compile_organ(OrganSpec(mesh, material, anchors=floor, damping=damping))
 
 
 def free_ball(mass: float, radius: float, drop: float, *, joint: str = FREE) -> ToolBodies:
-    """A solid ball of a mass [kg] and radius [m] at rest, `drop` [m] above the block's middle (and off it by 1 %)."""
+    """Solid ball of a mass [kg] and radius [m] at rest, `drop` [m] above the block's middle (and off it by 1 %)."""
     inertia = 0.4 * mass * radius**2
     place = f"{0.51 * BLOCK[0]} {0.49 * BLOCK[1]} {BLOCK[2] + radius + drop}"
     text = BALL.format(
@@ -223,12 +222,12 @@ def free_ball(mass: float, radius: float, drop: float, *, joint: str = FREE) -> 
 
 
 class Coupled:
-    """An organ and a free ball that exchange forces."""
+    """Organ and free ball with their exchange of forces."""
 
     def __init__(self, model: OrganModel, ball: ToolBodies, contact: ContactLaw = ELASTIC) -> None:
         """Start with the organ at rest and the ball as it is."""
         self.model, self.ball, self.contact = model, ball, contact
-        mujoco.mj_forward(ball.model, ball.data)  # its inertia, which `energy` reads
+        mujoco.mj_forward(ball.model, ball.data)  # `energy` reads its inertia.
         self.state: OrganState = rest_state(model, shape_count=1)
         self.wrench: FloatArray = np.zeros((1, 6))
         self._ground = BLOCK[2] + float(ball.shapes.shape_radius[0])
@@ -241,17 +240,17 @@ class Coupled:
             OrganDivergedError: an inverted tet, a number that is not finite, or a force beyond FORCE_CAP.
         """
         dt, compiled = HAPTIC_STEP / self._count, runs_compiled()
-        taken = haptic_steps(
+        result = haptic_steps(
             self.model, self.state, self.ball, self.contact, dt, self._count, self.wrench, compiled=compiled
         )
-        if taken.fault:
-            raise OrganDivergedError(taken.fault)
+        if result.fault:
+            raise OrganDivergedError(result.fault)
 
     def energy(self) -> float:
-        """Kinetic and potential energy of ball and organ and that of contact, all of the same instant [J].
+        """Kinetic and potential energy of ball and organ, and energy of contact, at the end of a haptic step [J].
 
-        After a haptic step coordinates and velocities of both are those of the step's end; the shapes are read anew,
-        because MuJoCo has placed the ball anew. The ball's height counts from where it would touch the block at rest.
+        MuJoCo has placed the ball anew, and its shapes are read anew. Its height counts from the touch of the block at
+        rest.
         """
         ball, mass = self.ball, float(self.ball.model.body_mass[1])
         mujoco.mj_kinematics(ball.model, ball.data)
@@ -262,7 +261,7 @@ class Coupled:
         return kinetic + lift + organ + contact_energy(self.model, self.state, ball.shapes, self.contact)
 
     def followed(self, duration: float) -> FloatArray:
-        """Energy at the start and after every haptic step of a duration [s], shape (n + 1,) [J]."""
+        """Energy at the start and after each haptic step of a duration [s], shape (n + 1,) [J]."""
         energies = [self.energy()]
         for _ in range(round(duration / HAPTIC_STEP)):
             self.step()
@@ -271,10 +270,10 @@ class Coupled:
 
 
 def bounces(falls: tuple[tuple[float, float], ...], duration: float = 10.0) -> Iterator[Result]:
-    """Balls of a mass [kg] that fall from a height [m] for 10 s, without alpha, friction and contact damping.
+    """Balls of a mass [kg] falling from a height [m], 10 s without alpha, friction and contact damping.
 
-    Energy is that of ball, organ and contact together, from the ball's touching height on: m g h at the start. A ball
-    that has sunk in is far below that, so the second row asks that no energy comes back later either.
+    Energy of ball, organ and contact is m g h at the start, counted from the ball's touch. A sunken ball is far below
+    that: the second row asks for no energy to come back later either.
     """
     model = small_block(Damping(alpha=0.0))
     for mass, height in falls:
@@ -300,7 +299,7 @@ def bounces(falls: tuple[tuple[float, float], ...], duration: float = 10.0) -> I
 
 
 def presses(count: int) -> Iterator[Row]:
-    """The tool's work on the tissue over many random presses, slides and releases, each from rest, losses on."""
+    """Work of the tool on the tissue over random presses, slides and releases, each from rest, with losses."""
     model = small_block(Damping(alpha=ALPHA))
     substeps = substeps_needed(HAPTIC_STEP, stable_dt(model, LOSSY))
     random = np.random.default_rng(3)
@@ -318,9 +317,9 @@ def presses(count: int) -> Iterator[Row]:
 
 
 def press_work(model: OrganModel, substeps: int, random: np.random.Generator) -> FloatArray:
-    """Work of the tool in each haptic step of one press from rest, -F . v dt [J], shape (n_step,).
+    """Work of the tool in each haptic step of a press from rest, -F . v dt [J], shape (n_step,).
 
-    A ball of 6 to 10 mm goes 1 to 4 mm into the block at 20 to 200 mm/s, sliding as it goes, then sideways, then out.
+    A ball of 6 to 10 mm slides 1 to 4 mm into the block at 20 to 200 mm/s, then sideways, then out.
     """
     radius, depth, speed = random.uniform(0.006, 0.010), random.uniform(0.001, 0.004), random.uniform(0.02, 0.2)
     site = random.uniform(0.3, 0.7, 2) * BLOCK[:2]

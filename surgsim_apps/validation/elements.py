@@ -1,4 +1,4 @@
-"""Reference solutions by quadratic elements of scikit-fem, a development dependency that is imported where it is used.
+"""Reference solutions by quadratic elements of scikit-fem, a development dependency imported where it is used.
 
 Hexahedra for blocks; axisymmetric quadrilaterals for the press of a punch on a bonded layer.
 """
@@ -22,13 +22,13 @@ Cells = tuple[int, int, int]
 
 
 def has_fem() -> bool:
-    """Whether scikit-fem can be imported."""
+    """True if scikit-fem can be imported."""
     return find_spec("skfem") is not None
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """A solid: stiffness [N/m], place of each row's node [m] (n, dimension) and its axis (n,).
+    """Elements of a solid: stiffness [N/m], place of each row's node [m] (n, dimension) and its axis (n,).
 
     The place is (x, y, z) in a block; (r, z) in a layer, a disc z = -depth to 0 held below.
     """
@@ -40,7 +40,7 @@ class Elements:
 
     @classmethod
     def assembled(cls, form: Any, basis: Any) -> "Elements":
-        """The elements of a basis with the stiffness of a bilinear form."""
+        """Elements of a basis with the stiffness of a bilinear form."""
         axis, dimension = np.zeros(basis.N, dtype=np.int64), len(basis.doflocs)
         for dofs in (basis.nodal_dofs, basis.edge_dofs, basis.facet_dofs, basis.interior_dofs):
             for component in range(dimension):
@@ -48,18 +48,18 @@ class Elements:
         return cls(csr_array(form.assemble(basis)), basis.doflocs.T, axis, basis)
 
     def rows_at(self, height: float) -> NDArray[np.int64]:
-        """Rows whose node lies at a height z [m]."""
+        """Rows of nodes at a height z [m]."""
         return np.flatnonzero(np.abs(self.place[:, -1] - height) < 1e-9)
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """Rows of a layer that do not move: the bonded floor, and no motion across the axis."""
+        """Fixed rows of a layer: the bonded floor, and motion across the axis on it."""
         on_axis = (self.place[:, 0] < 1e-12) & (self.axis == 0)
         return on_axis | (self.place[:, 1] <= self.place[:, 1].min() + 1e-12)
 
 
 def solid_block(size: Size, cells: Cells, youngs_modulus: float, poisson_ratio: float) -> Elements:
-    """The block [0, sx] x [0, sy] x [0, sz] of an isotropic solid in quadratic hexahedra (27 nodes each)."""
+    """Block [0, sx] x [0, sy] x [0, sz] of an isotropic solid in quadratic hexahedra (27 nodes each)."""
     from skfem import Basis, ElementHex2, ElementVector, MeshHex
     from skfem.models.elasticity import lame_parameters, linear_elasticity
 
@@ -69,7 +69,7 @@ def solid_block(size: Size, cells: Cells, youngs_modulus: float, poisson_ratio: 
 
 
 def clamped_torsion(size: Size, cells: Cells, modulus: float, nu: float) -> float:
-    """Torque per angle about z of a block whose ends are turned as rigid plates [N m/rad]."""
+    """Torque per angle about z of a block with ends turned as rigid plates [N m/rad]."""
     block = solid_block(size, cells, modulus, nu)
     top = block.rows_at(size[2])
     held = np.concatenate([block.rows_at(0.0), top])
@@ -101,7 +101,7 @@ def cantilever(size: Size, cells: Cells, modulus: float, nu: float, density: flo
 def layer(
     radius: float, depth: float, modulus: Callable[[FloatArray, FloatArray], FloatArray], poisson_ratio: float
 ) -> Elements:
-    """A bonded disc of modulus E(r, z) [Pa]: elements of 0.4 mm in the 16 mm around the press, and wider ones."""
+    """Bonded disc of modulus E(r, z) [Pa]: elements of 0.4 mm in the 16 mm around the press, wider ones elsewhere."""
     from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, MeshQuad
     from skfem.helpers import ddot, sym_grad
 
@@ -134,10 +134,10 @@ def punch_stiffness(body: Elements, radius: float) -> float:
 
 
 class BallContact:
-    """A frictionless ball on the top of a layer, small strains, by the contact law of this package.
+    """Frictionless ball on the top of a layer, small strains, by the contact law of this package.
 
-    Pressure per undeformed area k_p g (s / R), g = s (s + t) / R, where s^2 = R^2 - r^2 and t is the height of the
-    surface over the ball's centre; its points are engaged where s + t > 0.
+    Pressure per undeformed area k_p g (s / R), g = s (s + t) / R, with s^2 = R^2 - r^2 and the height t of the surface
+    over the ball's centre; points with s + t > 0 are engaged.
 
     Args:
         body: the layer.
@@ -164,13 +164,12 @@ class BallContact:
         self.push = LinearForm(lambda v, w: weight(w)[0] * (weight(w)[1] - (radius - w.depth)) * v[1])
 
     def engaged(self, displacement: FloatArray, depth: float) -> tuple[csc_array, FloatArray]:
-        """Stiffness [N/m] and load [N] of the points that a displacement engages: the ball exerts stiffness u + load.
+        """Stiffness [N/m] and load [N] of the engaged points at a displacement and a depth of the ball [m].
 
-        Both hold for a ball pressed in to `depth` [m].
+        The ball exerts stiffness u + load.
         """
-        before = self.surface.interpolate(displacement)
-        stiffness = csc_array(self.stiff.assemble(self.surface, prev=before, depth=depth))
-        return stiffness, self.push.assemble(self.surface, prev=before, depth=depth)
+        state = {"prev": self.surface.interpolate(displacement), "depth": depth}
+        return csc_array(self.stiff.assemble(self.surface, **state)), self.push.assemble(self.surface, **state)
 
     def pressed(
         self, stiffness: csc_array, load: FloatArray, held: NDArray[np.bool_], displacement: FloatArray, depth: float

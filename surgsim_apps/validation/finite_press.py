@@ -1,7 +1,7 @@
-"""A ball pressed into a bonded layer at finite strains: axisymmetric neo-Hookean finite elements of scikit-fem.
+"""Ball pressed into a bonded layer at finite strains: axisymmetric neo-Hookean finite elements of scikit-fem.
 
-The ball is rigid and frictionless; what holds the surface off it is a pressure per undeformed area, k_p times the
-penetration, as in the contact law of this package. With a large k_p this is a rigid ball without penetration.
+The ball is rigid and frictionless; it presses on the undeformed area with k_p times the penetration, as in the contact
+law of this package. A large k_p leaves next to no penetration.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,12 +14,12 @@ from scipy.sparse.linalg import splu
 
 from msdm_core.mesh import FloatArray
 
-# Pressure per penetration that stands for a rigid ball [N/m^3]: 5 kPa make 5 um.
+# Pressure per penetration of a rigid ball [N/m^3]: 5 kPa make 5 um.
 RIGID = 1e9
 # Poisson's ratio of a membrane on the top.
 MEMBRANE_RATIO = 0.5
-# Largest step of the depth [m], Newton's tolerance on the residual over the ball's force, its most
-# iterations, how often its step is halved, and how many iterations may raise the residual.
+# Largest step of the depth [m], Newton's tolerance on the residual over the ball's force, numbers of its iterations, of
+# halvings of its step, and of first iterations that may raise the residual.
 DEPTH_STEP = 2.5e-4
 TOLERANCE = 1e-6
 ITERATIONS = 60
@@ -50,9 +50,9 @@ def neo_hookean(gradient: NDArray, shear: NDArray, lame: NDArray) -> tuple[NDArr
     for part in range(5):
         tangent[part, part] += shear
     # dG / dF: the second derivatives of J.
-    for one, other, slope in ((0, 3, hoop), (1, 2, -hoop), (0, 4, zz), (1, 4, -zr), (2, 4, -rz), (3, 4, rr)):
-        tangent[one, other] += volume * slope
-        tangent[other, one] += volume * slope
+    for row, column, slope in ((0, 3, hoop), (1, 2, -hoop), (0, 4, zz), (1, 4, -zr), (2, 4, -rz), (3, 4, rr)):
+        tangent[row, column] += volume * slope
+        tangent[column, row] += volume * slope
     return stress, tangent, ratio
 
 
@@ -72,7 +72,7 @@ def layer_mesh(radius: float, depth: float, fine: float, reach: tuple[float, flo
 
 
 class PressedLayer:
-    """A bonded layer of modulus E(r, z) [Pa] under a ball, quadratic elements at finite strain."""
+    """Bonded layer of modulus E(r, z) [Pa] under a ball, quadratic elements at finite strain."""
 
     def __init__(self, mesh: Any, modulus: Modulus, poisson_ratio: float, *, membrane: float = 0.0) -> None:
         """Make the layer at rest.
@@ -80,7 +80,7 @@ class PressedLayer:
         Args:
             mesh: of `layer_mesh`.
             modulus: Young's modulus at places (r, z) [Pa].
-            poisson_ratio: of all of it.
+            poisson_ratio: of the layer.
             membrane: modulus times thickness of a membrane on its top [N/m].
         """
         from skfem import Basis, ElementQuad2, ElementVector, FacetBasis
@@ -104,16 +104,15 @@ class PressedLayer:
         self._membrane = membrane / (1.0 - MEMBRANE_RATIO**2)
 
     def forces(self, radius: float, depths: Sequence[float], contact_stiffness: float = RIGID) -> list[float]:
-        """Force of the ball at each of some rising depths of its lowest point below the surface at rest [N].
+        """Forces of the ball at rising depths of its lowest point below the surface at rest [N].
 
         Raises:
             ValueError: Newton's method does not converge.
         """
-        found = [
-            self._contact(one, radius, depth, contact_stiffness)[1][self._up].sum()
-            for depth, one in self._pressed(radius, depths, contact_stiffness)
+        return [
+            float(self._contact(displacement, radius, depth, contact_stiffness)[1][self._up].sum())
+            for depth, displacement in self._pressed(radius, depths, contact_stiffness)
         ]
-        return [float(force) for force in found]
 
     def load(self, radius: float, depth: float, contact_stiffness: float = RIGID) -> tuple[float, float]:
         """Largest contact pressure per undeformed area [Pa] and largest |lambda - 1| of the principal stretches."""
@@ -127,7 +126,7 @@ class PressedLayer:
     def _pressed(
         self, radius: float, depths: Sequence[float], contact_stiffness: float
     ) -> Iterator[tuple[float, FloatArray]]:
-        """Each depth [m] with the displacement in equilibrium there [m]."""
+        """Depths [m] with their displacements in equilibrium [m]."""
         displacement = np.zeros(self._basis.N)
         reached, target = 0.0, 0.0
         for depth in depths:
@@ -144,7 +143,7 @@ class PressedLayer:
             yield depth, displacement
 
     def _balanced(self, start: FloatArray, radius: float, depth: float, stiffness: float) -> FloatArray | None:
-        """Displacement in equilibrium [m] from a start, by Newton's method; None where it does not converge."""
+        """Displacement in equilibrium [m] from a start, by Newton's method; None without convergence."""
         u, free = start.copy(), self._free
         matrix, force, push = self._forces(u, radius, depth, stiffness)
         for iteration in range(ITERATIONS):
@@ -152,7 +151,7 @@ class PressedLayer:
             size = float(np.abs(residual).sum())
             if size <= TOLERANCE * float(np.abs(push).sum()):
                 return u
-            # Nearly symmetric as it is: an ordering for that takes a third of the time.
+            # An ordering for nearly symmetric matrices takes a third of the time.
             factors = splu(matrix[free][:, free].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
             change = factors.solve(-residual)
             # A long step may end in another equilibrium, with a crease in the surface.
@@ -160,9 +159,9 @@ class PressedLayer:
             for _ in range(HALVINGS):
                 trial = u.copy()
                 trial[free] += share * change
-                if self._smallest_ratio(trial) > 0.0:
+                if neo_hookean(self._strained(trial), *self._moduli)[2].min() > 0.0:
                     matrix, force, push = self._forces(trial, radius, depth, stiffness)
-                    # The first steps may go uphill; later ones must not, or points go in and out of contact for ever.
+                    # Later steps uphill would move points in and out of contact for ever.
                     if iteration < WILD or float(np.abs((force + push)[free]).sum()) < size:
                         break
                 share *= 0.5
@@ -179,9 +178,6 @@ class PressedLayer:
         held, push = self._contact(u, radius, depth, stiffness)
         return csc_array(matrix + held), force, push
 
-    def _smallest_ratio(self, u: FloatArray) -> float:
-        return float(neo_hookean(self._strained(u), *self._moduli)[2].min())
-
     def _strained(self, u: FloatArray) -> NDArray:
         """Deformation gradient of a displacement: F_rr, F_rz, F_zr, F_zz and the stretch around the axis (5, n, m)."""
         return np.array([1.0, 0.0, 0.0, 1.0, 1.0])[:, None, None] + np.einsum(
@@ -193,8 +189,8 @@ class PressedLayer:
         stress, tangent, _ = neo_hookean(self._strained(u), *self._moduli)
         matrix, vector = _assembled(self._basis, self._rates[:, :5], self._weight, stress, tangent)
         if self._membrane > 0.0:
-            more, pull = self._skin(u)
-            matrix, vector = matrix + more, vector + pull
+            skin_matrix, pull = self._skin(u)
+            matrix, vector = matrix + skin_matrix, vector + pull
         return matrix, vector
 
     def _top_values(self, u: FloatArray) -> NDArray:
@@ -215,8 +211,8 @@ class PressedLayer:
         stress = pull * first + round_pull * second
         tangent = size * (_outer(first, first) + _outer(second, second))
         tangent += size * ratio * (_outer(first, second) + _outer(second, first))
-        for part, held in enumerate((pull, pull, round_pull)):
-            tangent[part, part] += held
+        for part, tension in enumerate((pull, pull, round_pull)):
+            tangent[part, part] += tension
         weight = 2.0 * np.pi * r * self._top.dx
         return _assembled(self._top, self._top_rates[:, (0, 2, 4)], weight, stress, tangent)
 
@@ -236,22 +232,22 @@ class PressedLayer:
         return place / distance, np.maximum(radius - distance, 0.0), distance
 
 
-def _outer(one: NDArray, other: NDArray) -> NDArray:
-    return one[:, None] * other[None]
+def _outer(left: NDArray, right: NDArray) -> NDArray:
+    return left[:, None] * right[None]
 
 
 def _rates(basis: Any, r: NDArray) -> NDArray:
-    """Of each of an element's functions v: d/dr and d/dz of v_r and v_z, v_r / r, v_r, v_z (n_function, 7, n, m)."""
-    found = []
-    for (one,) in basis.basis:
-        value, gradient = np.broadcast_to(np.array(one), (2, *r.shape)), np.broadcast_to(one.grad, (2, 2, *r.shape))
-        found.append([*gradient.reshape(4, *r.shape), value[0] / r, *value])
-    return np.array(found)
+    """Rates of an element's functions v: v_r,r, v_r,z, v_z,r, v_z,z, v_r / r, v_r, v_z (n_function, 7, n, m)."""
+    rates = []
+    for (shape,) in basis.basis:
+        value, gradient = np.broadcast_to(np.array(shape), (2, *r.shape)), np.broadcast_to(shape.grad, (2, 2, *r.shape))
+        rates.append([*gradient.reshape(4, *r.shape), value[0] / r, *value])
+    return np.array(rates)
 
 
 def _assembled(basis: Any, rates: NDArray, weight: NDArray, stress: NDArray, tangent: NDArray) -> tuple[Any, NDArray]:
     """Matrix and vector of the sum over places of stress and tangent on the functions' rates (n_function, k, n, m)."""
-    vector, matrix = np.zeros(basis.N), 0.0
+    vector = np.zeros(basis.N)
     loaded = np.einsum("inea,nea,ea->ie", rates, stress, weight, optimize=True)
     np.add.at(vector, basis.element_dofs, loaded)
     stiff = np.einsum("nkea,jkea->jnea", tangent * weight, rates, optimize=True)

@@ -1,4 +1,4 @@
-"""Friction: a ball drawn over the phantom, a strip held between the pads of a jaw, a free block on supports."""
+"""Friction: a ball drawn over the phantom, a strip between the pads of a jaw, a free block on supports."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,12 +30,13 @@ from msdm_core.organ import (
     support_forces,
 )
 from surgsim_apps.validation.row import Row, compare
+from surgsim_apps.validation.statics import vector_areas
 from surgsim_apps.validation.touch import BallOnOrgan, ball, block
 
 RADIUS = 0.008  # [m]
 SPEED = 0.02  # [m/s]
-# Where the ball is drawn from, along which direction, and over how many haptic steps once 4 mm have settled it: two
-# periods of the lattice, so that what the mesh adds and takes away cancels.
+# Start of the ball, direction, and number of haptic steps after SETTLING: two periods of the lattice, over which the
+# mesh's part cancels.
 LINES = {
     "along edges": ((0.022, 0.030), (1.0, 0.0), 500),
     "between nodes": ((0.022, 0.0312), (1.0, 0.0), 500),
@@ -48,15 +49,15 @@ FRICTION_TOLERANCE = 0.05
 # The strip, its jaw and its weight.
 WIDTH, LENGTH = 0.010, 0.060  # [m]
 MODULUS, POISSON, DENSITY = 20e3, 0.45, 1060.0
-# Between the pads, and from where to where the strain is measured: a width away from pads and weight [m].
+# Length between the pads, height of the weight, levels of the measured strain, a width away from pads and weight [m].
 HELD, WEIGHT_HEIGHT = 0.010, 0.005
 GAUGE = (0.015, 0.040)
 WEIGHT = 0.004  # [kg]
 PAD_RADIUS = 0.0015  # [m]
 LAW = ContactLaw(stiffness=3e7, damping=100.0, friction=0.2, tangential_stiffness=1.5e7)
-# Of the pads, which are rougher than the law.
+# Of the pads, rougher than the law.
 FRICTION = 0.4
-# The load grows in steps of this share until the strip slips: the resolution of the slip load.
+# Growth of the load from step to step until the strip slips: the resolution of the slip load.
 LOAD_STEP = 0.02
 # A sticking strip moves by less than 2 mm; a strip that slips goes on falling [m].
 SLIPPED = 0.002
@@ -71,7 +72,7 @@ SLIDING_TIME = 0.3  # [s]
 
 
 def slide(touch: BallOnOrgan, line: str, depth: float) -> tuple[FloatArray, OrganState, ContactShapes]:
-    """Forces of the steady part [N] (n, 3), and the simulation at its end."""
+    """Forces of steady sliding [N] (n, 3), state and ball at its end."""
     start, direction, count = LINES[line]
     state, shapes = rest_state(touch.model, shape_count=1), ball(start, RADIUS)
     touch.move(state, shapes, (0.0, 0.0, -0.02), round(depth / 2e-5))
@@ -81,14 +82,14 @@ def slide(touch: BallOnOrgan, line: str, depth: float) -> tuple[FloatArray, Orga
 
 
 def coulomb(touch: BallOnOrgan, state: OrganState, shapes: ContactShapes, direction: FloatArray) -> tuple[float, float]:
-    """Friction along the motion from the stored stick-slip state, and mu times the local pressure along it, summed [N].
+    """Friction along the motion by the stored stick-slip state, and mu times the local pressure along it, summed [N].
 
-    On a point with the ball's normal e, sliding drags along the motion without its part along e. The pressure is that
-    of the law of contact, k_p g (s / r) with g = s (s + t) / r, from the deformed surface.
+    Sliding drags a point along the motion without its part along the ball's normal e. The pressure is k_p g (s / r) of
+    the contact law, g = s (s + t) / r, on the deformed surface.
     """
     model, law, radius = touch.model, touch.law, float(shapes.shape_radius[0])
     corners = state.node_position[model.surface_triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = vector_areas(state.node_position, model.surface_triangles)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     offset = np.einsum("qc,tcx->tqx", QUADRATURE_BARYCENTRIC, corners) - shapes.shape_ends[0, 0]
     height = np.einsum("tqx,tx->tq", offset, normal)
@@ -106,11 +107,11 @@ def coulomb(touch: BallOnOrgan, state: OrganState, shapes: ContactShapes, direct
 
 
 def sliding() -> Iterator[Row]:
-    """No jump above 2 % of the force from one haptic step to the next; steady friction."""
+    """Largest jump of the force between haptic steps, and steady friction, over sliding directions."""
     touch = block(12, alpha=None)
     friction = touch.law.friction
     for line, (_, direction, _) in LINES.items():
-        way = np.array([*direction, 0.0])
+        along = np.array([*direction, 0.0])
         force, _, _ = slide(touch, line, 0.004)
         jump = float((np.linalg.norm(np.diff(force, axis=0), axis=1) / np.linalg.norm(force[1:], axis=1)).max())
         yield compare(
@@ -119,7 +120,7 @@ def sliding() -> Iterator[Row]:
             note=f"share of the force; tip 8 mm, 4 mm deep, {1e3 * SPEED:g} mm/s, friction {friction:g}",
         )  # fmt: skip
         shallow, _, _ = slide(touch, line, 0.0015)
-        share = -shallow @ way / shallow[:, 2]
+        share = -shallow @ along / shallow[:, 2]
         yield compare(
             f"sliding {line}, tangential force over mu N", "Coulomb", expected=1.0,
             measured=float(share.mean()) / friction, tolerance=FRICTION_TOLERANCE,
@@ -131,12 +132,12 @@ def sliding() -> Iterator[Row]:
 
 
 def deep_friction(touch: BallOnOrgan) -> Row:
-    """4 mm deep: friction against mu times the pressure, point by point; the tissue pushed ahead adds to the drag."""
+    """Friction of a ball 4 mm deep against mu times the pressure, point by point."""
     line = "between nodes"
-    way = np.array([*LINES[line][1], 0.0])
+    along = np.array([*LINES[line][1], 0.0])
     force, state, shapes = slide(touch, line, 0.004)
-    measured, expected = coulomb(touch, state, shapes, way)
-    total = float((-force @ way / (touch.law.friction * force[:, 2])).mean())
+    measured, expected = coulomb(touch, state, shapes, along)
+    total = float((-force @ along / (touch.law.friction * force[:, 2])).mean())
     return compare(
         "sliding 4 mm deep, friction over the integral of mu p", "Coulomb at each point", expected=1.0,
         measured=measured / expected, tolerance=FRICTION_TOLERANCE,
@@ -146,7 +147,7 @@ def deep_friction(touch: BallOnOrgan) -> Row:
 
 
 def sticking() -> Row:
-    """A ball moved aside below the friction limit: change of the force in half a second over the normal force."""
+    """Ball moved aside below the friction limit: change of the force in half a second over the normal force."""
     soft = block(12)
     touch = BallOnOrgan.on(soft.model, soft.law._replace(friction=0.8))
     state, shapes = rest_state(touch.model, shape_count=1), ball((0.03, 0.03), RADIUS)
@@ -162,7 +163,7 @@ def sticking() -> Row:
 
 @dataclass(frozen=True, eq=False)
 class HangingStrip:
-    """A strip between two pads that close along x; each run has its own gravity.
+    """Strip between two pads that close along x, with a gravity for each run.
 
     Args:
         model, state: of the strip.
@@ -178,11 +179,11 @@ class HangingStrip:
     def run(
         self, duration: float, *, gravity: float = 0.0, tilt: float = 0.0, closing: float = 0.0, turning: float = 0.0
     ) -> FloatArray:
-        """Advance by a time; returns the last wrenches on the pads [N, N m], shape (2, 6).
+        """Advance by a duration; returns the last wrenches on the pads [N, N m], shape (2, 6).
 
         Args:
             duration: [s].
-            gravity: pulls along -z [m/s^2].
+            gravity: along -z [m/s^2].
             tilt: of gravity about x [rad].
             closing: of each pad [m/s].
             turning: of both about x, around their middle [rad/s].
@@ -204,7 +205,7 @@ class HangingStrip:
         return wrench
 
     def height(self, level: float) -> float:
-        """Mean present position of the nodes that rest at a level [m]."""
+        """Mean present height of the nodes of a level at rest [m]."""
         nodes = np.abs(self.model.node_rest_position[:, 2] - level) < 1e-6
         return float(self.state.node_position[nodes, 2].mean())
 
@@ -214,11 +215,9 @@ class HangingStrip:
         return self.height(GAUGE[1]) - self.height(GAUGE[0])
 
     def carried(self, gravity: float) -> float:
-        """Weight below, averaged over the gauge's levels: the tension that stretches it [N]."""
-        rest = self.model.node_rest_position[:, 2]
-        return gravity * float(
-            np.mean([self.model.node_mass[rest < level].sum() for level in np.linspace(*GAUGE, 101)])
-        )
+        """Tension of the gauge [N]: mean of the weight below its levels."""
+        rest, mass = self.model.node_rest_position[:, 2], self.model.node_mass
+        return gravity * float(np.mean([mass[rest < level].sum() for level in np.linspace(*GAUGE, 101)]))
 
 
 def grip(wrench: FloatArray) -> float:
@@ -227,7 +226,7 @@ def grip(wrench: FloatArray) -> float:
 
 
 def gripped_strip(friction: float = FRICTION) -> HangingStrip:
-    """A strip 10 x 10 x 60 mm, its lowest 5 mm heavier by 4 g, gripped with 0.33 N without gravity, at rest."""
+    """Strip of 10 x 10 x 60 mm, its lowest 5 mm heavier by 4 g, at rest in a grip of 0.33 N without gravity."""
     box = box_mesh((WIDTH, WIDTH, LENGTH), (4, 4, 24))
     low = box.points[box.tets].mean(axis=1)[:, 2] < WEIGHT_HEIGHT
     mesh = TetMesh(box.points, box.tets, np.where(low, 1, 0), {0: "strip", 1: "weight"})
@@ -246,24 +245,25 @@ def gripped_strip(friction: float = FRICTION) -> HangingStrip:
 
 
 def slip(strip: HangingStrip, gravity: float) -> tuple[float, float]:
-    """Largest load that the jaw held and the grip at that load [N], starting from a gravity [m/s^2].
+    """Largest load held by the jaw and grip at that load [N], from a gravity on [m/s^2].
 
     Raises:
         ValueError: the strip never slipped.
     """
     mass = float(strip.model.node_mass.sum())
-    held = strip.run(0.6, gravity=gravity)
-    hung = strip.height(LENGTH)
+    wrench = strip.run(0.6, gravity=gravity)
+    height = strip.height(LENGTH)
     for _ in range(40):
-        wrench = strip.run(0.1, gravity=gravity * (1.0 + LOAD_STEP))
-        if strip.height(LENGTH) < hung - SLIPPED:
-            return gravity * mass, grip(held)
-        gravity, held = gravity * (1.0 + LOAD_STEP), wrench
+        heavier = gravity * (1.0 + LOAD_STEP)
+        heavier_wrench = strip.run(0.1, gravity=heavier)
+        if strip.height(LENGTH) < height - SLIPPED:
+            return gravity * mass, grip(wrench)
+        gravity, wrench = heavier, heavier_wrench
     raise ValueError(f"the strip never slipped, up to {gravity * mass:.3f} N")
 
 
 def grasped_strip() -> Iterator[Row]:
-    """Hung on its jaw: reaction against weight, strain against F / (E A), and the load at which it slips."""
+    """Strip hung on its jaw: reaction against weight, strain against F / (E A), and slip load."""
     strip, gravity = gripped_strip(), 8.5
     resting = strip.gauge_length
     wrench = strip.run(0.6, gravity=gravity)
@@ -296,7 +296,7 @@ def free_block(
     modulus: float = 5000.0,
     anchored: bool = False,
 ) -> OrganModel:
-    """A block of 40 x 40 x 20 mm, 5 mm cells, that stands free on z = 0 (of a turned frame), its middle over 0."""
+    """Free block of 40 x 40 x 20 mm, 5 mm cells, on z = 0 (of a turned frame), its middle over 0."""
     mesh = box_mesh((0.04, 0.04, 0.02), (8, 8, 4))
     points = mesh.points + np.array([-0.02, -0.02, lift])
     anchors = np.flatnonzero(points[:, 0] < -0.0199) if anchored else ()
@@ -315,23 +315,23 @@ def free_block(
 
 
 def on_incline(tilt: float, friction: float) -> tuple[OrganModel, OrganState]:
-    """A block settled on a plane that falls towards +x by an angle [rad], held there by friction of 2, then by less."""
+    """Block settled on an incline towards +x of an angle [rad] with a friction of 2, then with the given one."""
     slope = Support("slope", "plane", axis=(np.sin(tilt), 0.0, np.cos(tilt)), friction=2.0)
     model = free_block(slope, frame=slope.frame, damping=Damping(alpha=0.0, beta=1e-3), modulus=20000.0)
     state = rest_state(model)
-    left = np.array([friction])
-    left.setflags(write=False)
-    return model._replace(support_friction=left), state
+    friction_array = np.array([friction])
+    friction_array.setflags(write=False)
+    return model._replace(support_friction=friction_array), state
 
 
 def run(model: OrganModel, state: OrganState, seconds: float, dt: float | None = None) -> None:
-    """Advance by whole substeps, of 0.9 of the stable step unless `dt` [s] is given."""
+    """Advance by whole substeps of `dt` [s], by default of 0.9 of the stable step."""
     dt = STEP_SHARE * model.stable_step if dt is None else dt
     advance(model, state, dt=dt, substep_count=round(seconds / dt))
 
 
 def slid(tilt: float, friction: float) -> tuple[float, float]:
-    """Acceleration down an incline [m/s^2], mean of 0.3 s from rest: from the path 2 x / t^2, from the speed v / t."""
+    """Mean acceleration down an incline in 0.3 s from rest [m/s^2]: by the path 2 x / t^2, by the speed v / t."""
     model, state = on_incline(tilt, friction)
     down, mass = np.array([np.cos(tilt), 0.0, -np.sin(tilt)]), model.node_mass.sum()
     dt = STEP_SHARE * model.stable_step
@@ -344,9 +344,9 @@ def slid(tilt: float, friction: float) -> tuple[float, float]:
 
 
 def crept(tilt: float, friction: float) -> float:
-    """Largest creep of any node in half a second on an incline that holds the block [m].
+    """Largest creep of a node in half a second on an incline that holds the block [m].
 
-    Half a second before, friction becomes that of the incline: what lies near its limit gives, and the block swings.
+    It counts half a second after the change of friction, at which nodes near the limit slip and the block swings.
     """
     model, state = on_incline(tilt, friction)
     run(model, state, 0.5)
@@ -356,7 +356,7 @@ def crept(tilt: float, friction: float) -> float:
 
 
 def on_supports() -> Iterator[Row]:
-    """Weight on a plane, no creep below the angle of friction, g (sin a - mu cos a) above it."""
+    """Weight on a plane, no creep below the angle of friction, acceleration g (sin a - mu cos a) above it."""
     model = free_block(FLOOR)
     force = support_forces(model, rest_state(model)).sum(axis=0)
     yield compare(

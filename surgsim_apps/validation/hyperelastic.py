@@ -1,4 +1,4 @@
-"""Blocks at finite strain: quadratic hexahedra of a hyperelastic solid, and the organ in static equilibrium.
+"""Blocks at finite strain: quadratic hexahedra of a hyperelastic solid, and an organ in static equilibrium.
 
 A block with faces square to the axes is pulled, compressed or sheared by its ends z = 0 and z = height. Ends are bonded
 to plates, or slide on them. The solids are those of `surgsim_apps.validation.continuum`.
@@ -19,17 +19,17 @@ from msdm_core.mesh import FloatArray, TetMesh
 from msdm_core.organ import node_strains, rest_state
 from surgsim_apps.validation.continuum import STRAIN_LEAST
 from surgsim_apps.validation.elements import Cells, Size
-from surgsim_apps.validation.statics import averaged_gradient, block_sum, node_rows, volume_gradient
+from surgsim_apps.validation.statics import averaged_gradient, block_sum, node_rows, nodes_at, volume_gradient
 
 Test = Literal["pull", "slide", "shear"]
-# Forces balance to this share of the force on a plate.
+# Residual of the forces over the force on a plate.
 RESIDUAL = 1e-7
 STRAIN_STEP = 0.02
 ROUNDS, HALVINGS = 40, 8
 
 
 class SolidWithTangent(Protocol):
-    """A solid with the derivative of its stress."""
+    """Solid with the derivative of its stress."""
 
     def first_piola(self, gradient: FloatArray) -> FloatArray:
         """P [Pa], (..., 3, 3)."""
@@ -42,12 +42,12 @@ class SolidWithTangent(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Plates:
-    """Rows of a block's displacement that its plates hold, and their displacement per unit of the test.
+    """Rows of a block's displacement held by its plates, and their displacement per unit of the test.
 
     Args:
         held: rows (n,), three a node.
         direction: displacement of these rows at unit strain [m], (n,).
-        loaded: rows whose forces sum to the force on the upper plate.
+        loaded: rows of the forces on the upper plate.
     """
 
     held: NDArray[np.int64]
@@ -56,21 +56,21 @@ class Plates:
 
     @classmethod
     def of(cls, points: FloatArray, test: Test) -> "Plates":
-        """The plates of a block with nodes at `points` [m], (n_node, 3); strain is over its height.
+        """Plates of a block with nodes at `points` [m], (n_node, 3); strain is over its height.
 
         "pull": bonded ends drawn apart. "slide": ends drawn apart, free to slide. "shear": bonded ends, the upper one
         moved along x.
         """
         height = points[:, 2].max()
-        low, high = np.flatnonzero(points[:, 2] < 1e-9), np.flatnonzero(points[:, 2] > height - 1e-9)
+        low, high = nodes_at(points, 0.0), nodes_at(points, height)
         ends = np.concatenate([low, high])
         moved = np.repeat([0.0, height], [len(low), len(high)])
         if test == "slide":
             held, direction = 3 * ends + 2, moved
-            # The middle of the block's faces x = 0 and y = 0 slides in its plane: no drift, no turn, nothing bent.
+            # Nodes of the middle planes across x and y slide in these planes: no drift, no turn, no bending.
             middle = points.max(axis=0) / 2.0
             for axis in (0, 1):
-                plane = np.flatnonzero(np.abs(points[:, axis] - middle[axis]) < 1e-9)
+                plane = nodes_at(points, middle[axis], axis)
                 held = np.concatenate([held, 3 * plane + axis])
                 direction = np.concatenate([direction, np.zeros(len(plane))])
             return cls(held, direction, 3 * high + 2)
@@ -83,7 +83,7 @@ class Plates:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticBlock:
-    """The block [0, sx] x [0, sy] x [0, sz] of a solid in quadratic hexahedra at finite strain (total Lagrangian).
+    """Block [0, sx] x [0, sy] x [0, sz] of a solid in quadratic hexahedra at finite strain (total Lagrangian).
 
     Args:
         points: of the nodes [m], (n_node, 3).
@@ -99,12 +99,12 @@ class QuadraticBlock:
 
     @classmethod
     def of(cls, size: Size, cells: Cells) -> "QuadraticBlock":
-        """The block with some elements along x, y and z."""
+        """Block with a number of elements along x, y and z."""
         from skfem import Basis, ElementHex2, ElementVector, MeshHex
 
         mesh = MeshHex.init_tensor(*(np.linspace(0.0, length, count + 1) for length, count in zip(size, cells)))
         basis = Basis(mesh, ElementVector(ElementHex2()), intorder=5)
-        slopes = np.array([one[0].grad for one in basis.basis])
+        slopes = np.array([shape.grad for (shape,) in basis.basis])
         order, place = _rows_by_node(basis)
         return cls(
             place, order[basis.element_dofs.T],
@@ -112,7 +112,7 @@ class QuadraticBlock:
         )  # fmt: skip
 
     def response(self, solid: SolidWithTangent, displacement: FloatArray) -> tuple[FloatArray, csc_array]:
-        """Forces of the solid on the plates and nodes [N], (3 n_node,), and their derivative [N/m]."""
+        """Forces of the solid on plates and nodes [N], (3 n_node,), and their derivative [N/m]."""
         count, points = self.weights.shape
         gradient = np.eye(3) + np.einsum("epra,er->epa", self.slopes, displacement[self.rows], optimize=True).reshape(
             count, points, 3, 3
@@ -124,7 +124,7 @@ class QuadraticBlock:
         return _assembled(force, blocks, self.rows, 3 * len(self.points))
 
     def forces(self, solid: SolidWithTangent, test: Test, strains: tuple[float, ...]) -> list[float]:
-        """Force on the upper plate at strains that follow each other [N]."""
+        """Force on the upper plate at successive strains [N]."""
         plates = Plates.of(self.points, test)
         displacement = np.zeros(3 * len(self.points))
         return _forces(lambda u: self.response(solid, u), plates, displacement, strains, test)
@@ -159,14 +159,16 @@ def _forces(
     strains: tuple[float, ...],
     name: str,
 ) -> list[float]:
-    """Force on the loaded plate at strains that follow each other [N], reached by steps of at most STRAIN_STEP."""
-    before, found = 0.0, []
+    """Force on the loaded plate at successive strains [N], reached by steps of at most STRAIN_STEP."""
+    before, forces = 0.0, []
     for strain in strains:
         count = max(1, int(np.ceil(abs(strain - before) / STRAIN_STEP - 1e-9)))
-        steps = np.linspace(before, strain, count + 1)[1:]
-        found.append([_balanced(response, plates, displacement, float(one), f"{name} {one:g}") for one in steps][-1])
+        force = 0.0
+        for target in np.linspace(before, strain, count + 1)[1:]:
+            force = _balanced(response, plates, displacement, float(target), f"{name} {target:g}")
+        forces.append(force)
         before = strain
-    return found
+    return forces
 
 
 def _balanced(
@@ -176,14 +178,14 @@ def _balanced(
     strain: float,
     name: str,
 ) -> float:
-    """Bring a displacement in place to equilibrium between plates at a strain (Newton); returns the plate's force [N].
+    """Force on the plate [N] in equilibrium at a strain (Newton's method); changes the displacement in place.
 
     Raises:
-        ValueError: no equilibrium was found; names the test.
+        ValueError: no equilibrium; names the test.
     """
     free = np.setdiff1d(np.arange(len(displacement)), plates.held)
     force, stiffness = response(displacement)
-    # The plates move once, and everything follows as in a linear body.
+    # The first step moves the plates, and the block as a linear body.
     change = strain * plates.direction - displacement[plates.held]
     step = np.zeros_like(displacement)
     step[plates.held] = change
@@ -212,9 +214,9 @@ def solved(stiffness: csc_array, free: NDArray[np.int64], right: FloatArray) -> 
 
 @dataclass(frozen=True, eq=False)
 class OrganBlock:
-    """A block as an organ: forces by its kernels, statics by Newton's method with springs and volume terms.
+    """Block as an organ: forces by its kernels, statics by Newton's method with springs and volume terms.
 
-    The matrix only leads to the equilibrium; what is in equilibrium are the forces of the kernels.
+    The matrix only leads to the equilibrium, which is that of the kernels' forces.
 
     Args:
         mesh: the block.
@@ -227,7 +229,7 @@ class OrganBlock:
     stiffening: Stiffening | None = None
 
     def forces(self, test: Test, strains: tuple[float, ...]) -> list[float]:
-        """Force on the upper plate at strains that follow each other [N]."""
+        """Force on the upper plate at successive strains [N]."""
         plates, state = Plates.of(self.mesh.points, test), rest_state(self.model)
         displacement = np.zeros(self.mesh.points.size)
         return _forces(lambda u: self.response(state, u), plates, displacement, strains, f"organ, {test}")
@@ -241,10 +243,10 @@ class OrganBlock:
         return -state.node_force.ravel(), csc_array(matrix)
 
     def _springs(self, position: FloatArray) -> csc_array:
-        """Tangent of the springs, (T / x) n n^T + (T / l) (1 - n n^T), x = l - l0, and what their ends add [N/m].
+        """Tangent of the springs, (T / x) n n^T + (T / l) (1 - n n^T), x = l - l0, with its part by their ends [N/m].
 
-        T = k x (1 + (r_a + r_b) / 2) with the rises r of both ends, of which r_a changes with all springs u of node a:
-        dr_a / dx_u = (dr_a / ds_a) q_a k_u x_u / s_a, where s_a^2 = q_a sum k x^2.
+        T = k x (1 + (r_a + r_b) / 2) with the rises r of both ends. r_a changes with all springs u of node a:
+        dr_a / dx_u = (dr_a / ds_a) q_a k_u x_u / s_a, s_a^2 = q_a sum k x^2.
         """
         model, nodes = self.model, self.model.spring_nodes
         span = position[nodes[:, 1]] - position[nodes[:, 0]]
@@ -269,11 +271,11 @@ class OrganBlock:
             (np.tile(values.ravel(), 2), (np.repeat(nodes.T.ravel(), 6), np.tile(node_rows(nodes).ravel(), 2))),
             shape=(len(position), position.size),
         ).tocsr()
-        more = 0.5 * model.node_softness * (self.stiffening.tangent(strain) - 1.0 - rise) / strain**2
-        return csc_array(total + sums.T @ sums.multiply(more[:, None]).tocsr())
+        slope = 0.5 * model.node_softness * (self.stiffening.tangent(strain) - 1.0 - rise) / strain**2
+        return csc_array(total + sums.T @ sums.multiply(slope[:, None]).tocsr())
 
     def _volumes(self, position: FloatArray) -> csc_array:
-        """Tangent of the volume terms, K / V0 dV dV^T + p d2V, p the tension of each tet and of its nodes [N/m]."""
+        """Tangent of the volume terms, K / V0 dV dV^T + p d2V, with the tension p of a tet and of its nodes [N/m]."""
         model, count = self.model, position.size
         gradient = volume_gradient(position, model.tet_nodes)
         volume = (gradient * position[model.tet_nodes].reshape(-1, 12)).sum(axis=1) / 3.0
@@ -305,12 +307,12 @@ def _volume_curvature(corners: FloatArray) -> FloatArray:
     6 V = b . (c x d) with edges from the first corner: d(6 V)/db dc = -[d], [d] x = d x x; the first corner's rows are
     minus the sums of the others'.
     """
-    b, c, d = (corners[:, one] - corners[:, 0] for one in (1, 2, 3))
-    found = np.zeros((len(corners), 4, 3, 4, 3))
+    b, c, d = (corners[:, corner] - corners[:, 0] for corner in (1, 2, 3))
+    curvature = np.zeros((len(corners), 4, 3, 4, 3))
     for first, second, edge in ((1, 2, d), (2, 3, b), (3, 1, c)):
         turn = np.cross(np.eye(3)[None], edge[:, None, :]) / 6.0
-        found[:, first, :, second, :] = turn.transpose(0, 2, 1)
-        found[:, second, :, first, :] = turn
-    found[:, 0] = -found[:, 1:].sum(axis=1)
-    found[:, :, :, 0] = -found[:, :, :, 1:].sum(axis=3)
-    return found.reshape(-1, 12, 12)
+        curvature[:, first, :, second, :] = turn.transpose(0, 2, 1)
+        curvature[:, second, :, first, :] = turn
+    curvature[:, 0] = -curvature[:, 1:].sum(axis=1)
+    curvature[:, :, :, 0] = -curvature[:, :, :, 1:].sum(axis=3)
+    return curvature.reshape(-1, 12, 12)

@@ -1,8 +1,7 @@
-"""Masses, springs and moduli of the lattice: lumped masses, elastic constants, blocks, a wave, a sphere, graded cells.
+"""Lattice: lumped masses, elastic constants, moduli of blocks, a wave, a sphere, graded cells.
 
-At a seam between cells h and 2 h tets are not those of a BCC lattice and formula (6) is not isotropic. Fitted springs
-do not mend that: they would leave nodes loose there, and fall back to formula (6) times a scalar
-(`msdm_core.material.fitting`).
+Tets at a seam between cells h and 2 h are not those of a BCC lattice, and formula (6) is not isotropic there. Fitted
+springs would leave nodes loose at it, and fall back to formula (6) times a scalar (`msdm_core.material.fitting`).
 """
 
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from surgsim_apps.validation.statics import (
     assemble_stiffness,
     linear_organ,
     nodal_dofs,
+    nodes_at,
     pull_stiffness,
     solve_displacement,
     twice_energy,
@@ -35,14 +35,14 @@ CUBE_ROOT_2 = 2.0 ** (1.0 / 3.0)
 FORMULA = "formula (6) on tets of volume a^3/12, by hand"
 PAPER = "Sala 2011, Table I"
 
-# Height over base edge of the cap that has the printed cells; its AR is 0.6108 and 0.2549, printed as 0.6 and 0.2.
+# Height over base edge of the caps with the printed cells; their AR are 0.6108 and 0.2549, printed as 0.6 and 0.2.
 PRINTED = ((0.40365, -50.74, 152.23, "AR printed 0.6, is 0.611"), (0.1542, -74.50, 223.48, "AR printed 0.2, is 0.255"))
-# The cap with exactly that AR, and the closed form V_base / V = (1/3 + (h/a)^2)^2 / 2.
+# Caps of exactly that AR, for the closed form V_base / V = (1/3 + (h/a)^2)^2 / 2.
 EXACT = ((0.394960, 0.6), (0.120087, 0.2))
 
 WAVE_CELL = 0.005  # [m]
 WAVE_RATIOS = (0.25, 0.40, 0.45, 0.49)
-# No tolerance is given; a trial of nodal volumes lay within 3 % of nu = 1/4 (facts, section 8), so does this one.
+# Chosen: a trial of nodal volumes lay within 3 % of nu = 1/4 (facts, section 8).
 WAVE_TOLERANCE = 0.03
 
 SOFT = 5e3  # [Pa] around a sphere
@@ -58,7 +58,7 @@ SHARE_LARGEST, ANGLE_SMALLEST = 0.4, 8.0
 
 
 def cap(height: float) -> FloatArray:
-    """An equilateral triangle of edge 1 with its apex at a height above the centre, shape (4, 3)."""
+    """Tet on an equilateral triangle of edge 1 with its apex at a height above the centre, shape (4, 3)."""
     turn = 2.0 * np.pi * np.arange(3) / 3.0
     base = np.stack([np.cos(turn), np.sin(turn), np.zeros(3)], axis=1) / np.sqrt(3.0)
     return np.vstack([base, [0.0, 0.0, height]])
@@ -71,7 +71,7 @@ def cell_differences(height: float) -> tuple[float, float]:
 
 
 def table_one() -> Iterator[Row]:
-    """The printed pairs at the tets that have them, and the closed form at the AR that the table names."""
+    """Printed pairs at their tets, and the closed form at the printed AR."""
     for height, low, high, note in PRINTED:
         for name, expected, measured in zip(("min", "max"), (low, high), cell_differences(height), strict=True):
             yield compare(
@@ -95,7 +95,7 @@ def mass_sum() -> Iterator[Row]:
     """Sum of the node masses against density x volume of the block, on a mesh without symmetry."""
     size = np.array([0.02, 0.05, 0.10])
     lattice = box_mesh(size, (4, 10, 20))
-    # This map keeps the faces of the block in place: the volume stays the same, every tet changes.
+    # The map keeps faces and volume of the block, and changes every tet.
     inner = np.prod(np.sin(np.pi * lattice.points / size), axis=1)
     mesh = TetMesh(lattice.points + inner[:, None] * np.array([1e-3, -8e-4, 6e-4]), lattice.tets)
     for scheme in ("barycentric", "voronoi"):
@@ -106,7 +106,7 @@ def mass_sum() -> Iterator[Row]:
 
 
 def constants() -> Iterator[Row]:
-    """k_cube, k_diag of formula (6), and C11, C12, C44 of the two nodes that fill one cell."""
+    """k_cube and k_diag of formula (6), and C11, C12 and C44 of the two nodes of a cell."""
     mesh = box_mesh((5 * CELL,) * 3, (5,) * 3)
     edges, stiffness = spring_network(mesh, MODULUS)
     length = np.linalg.norm(mesh.points[edges[:, 1]] - mesh.points[edges[:, 0]], axis=1)
@@ -125,7 +125,7 @@ def constants() -> Iterator[Row]:
 
 
 def _cell_tensor(mesh: TetMesh, edges: np.ndarray, stiffness: FloatArray) -> FloatArray:
-    """C_ijkl = (1 / a^3) sum k l^2 n_i n_j n_k n_l over the springs of one corner and one centre node, halved."""
+    """C_ijkl = (1 / a^3) sum k l^2 n_i n_j n_k n_l over the springs of a corner and a centre node, halved."""
     distance = np.linalg.norm(mesh.points - 2.5 * CELL, axis=1)
     centre = int(np.argmin(distance))
     corner = int(np.argsort(distance, kind="stable")[1])
@@ -143,7 +143,7 @@ def thick_block(cells: int) -> Iterator[Row]:
 
 
 def graded_block() -> Iterator[Row]:
-    """E, G and K of a thick block whose upper third is fine, along the seam and across it."""
+    """E, G and K of a thick block with a fine upper third, along the seam and across it."""
     size = GRADED_CELLS * CELL
     mesh = box_mesh((size,) * 3, (GRADED_CELLS,) * 3, coarsening=2, fine_depth=size / 3.0)
     pulls = {" across the seam": 2, " along the seam": 0}
@@ -157,22 +157,22 @@ def _moduli(
 ) -> Iterator[Row]:
     """E along each axis, G in each plane of two axes, and K of a cube."""
     stiffness = assemble_stiffness(linear_organ(mesh, MODULUS, nu))
-    found = [(f"E{where}", uniaxial_modulus(mesh, stiffness, axis), MODULUS) for where, axis in pulls.items()]
+    moduli = [(f"E{where}", uniaxial_modulus(mesh, stiffness, axis), MODULUS) for where, axis in pulls.items()]
     for where, (i, j) in shears.items():
         gradient = np.zeros((3, 3))
         gradient[i, j] = gradient[j, i] = 0.5
         # W = G gamma^2 / 2 and, below, W = 9 K e^2 / 2.
-        found.append((f"G{where}", affine_modulus(mesh, stiffness, gradient), MODULUS / (2.0 * (1.0 + nu))))
+        moduli.append((f"G{where}", affine_modulus(mesh, stiffness, gradient), MODULUS / (2.0 * (1.0 + nu))))
     bulk = affine_modulus(mesh, stiffness, np.eye(3)) / 9.0
-    for what, measured, expected in (*found, ("K", bulk, MODULUS / (3.0 * (1.0 - 2.0 * nu)))):
+    for modulus, measured, expected in (*moduli, ("K", bulk, MODULUS / (3.0 * (1.0 - 2.0 * nu)))):
         yield compare(
-            f"{name}, nu {nu:.2f}, {what}", "isotropic solid of (E, nu)", expected=expected, measured=measured,
+            f"{name}, nu {nu:.2f}, {modulus}", "isotropic solid of (E, nu)", expected=expected, measured=measured,
             tolerance=tolerance, unit="Pa",
         )  # fmt: skip
 
 
 def uniaxial_modulus(mesh: TetMesh, stiffness: csr_array, axis: int = 2) -> float:
-    """Young's modulus of a cube from a stretch whose ends slide freely [Pa]."""
+    """Young's modulus of a cube by a stretch with freely sliding ends [Pa]."""
     return pull_stiffness(mesh, stiffness, axis) / float(mesh.points[:, axis].max())
 
 
@@ -185,24 +185,24 @@ def affine_modulus(mesh: TetMesh, stiffness: csr_array, gradient: FloatArray) ->
 
 
 def cosine_load(half_waves: tuple[int, ...]) -> Iterator[Result]:
-    """A cosine pressure on a deep block: whether the volume term locks, which uniform strain cannot show.
+    """Cosine pressure on a deep block: locking of the volume term, invisible in uniform strain.
 
-    How much stiffer than at nu = 1/4 the lattice is, each over its closed form; 1 where nothing locks.
+    Stiffness of the lattice over its stiffness at nu = 1/4, each over its closed form; 1 without locking.
     """
     for half_wave in half_waves:
-        found = [cosine_stiffness(nu, half_wave) for nu in WAVE_RATIOS]
-        for nu, value in zip(WAVE_RATIOS[1:], found[1:], strict=True):
+        base, *others = shares = [cosine_stiffness(nu, half_wave) for nu in WAVE_RATIOS]
+        for nu, share in zip(WAVE_RATIOS[1:], others, strict=True):
             yield compare(
                 f"cosine load, half-wave of {half_wave} cells, nu {nu:.2f} against 0.25", "E k / (2 (1 - nu^2))",
-                expected=1.0, measured=value / found[0], tolerance=WAVE_TOLERANCE,
-                note=f"stiffness / closed form {value:.3f}, at nu 0.25 {found[0]:.3f}",
+                expected=1.0, measured=share / base, tolerance=WAVE_TOLERANCE,
+                note=f"stiffness / closed form {share:.3f}, at nu 0.25 {base:.3f}",
             )  # fmt: skip
         labels = ("Poisson's ratio", "stiffness / closed form", False)
-        yield Curve("locking", f"half-wave of {half_wave} cells", WAVE_RATIOS, tuple(found), *labels)
+        yield Curve("locking", f"half-wave of {half_wave} cells", WAVE_RATIOS, tuple(shares), *labels)
 
 
 def cosine_stiffness(nu: float, half_wave: int) -> float:
-    """Pressure over displacement of the cosine on the springs, over the closed form E k / (2 (1 - nu^2)).
+    """Pressure over displacement of the cosine, over the closed form E k / (2 (1 - nu^2)).
 
     Half-space, plane strain: p cos(k x) gives u_z = 2 (1 - nu^2) p cos(k x) / (E k). Side faces slide, the floor two
     wavelengths down is held.
@@ -211,21 +211,18 @@ def cosine_stiffness(nu: float, half_wave: int) -> float:
     size = counts * WAVE_CELL
     mesh = box_mesh(size, counts)
     wave = np.pi / (half_wave * WAVE_CELL)
-    x, y, z = mesh.points.T
     triangles = mesh.boundary_triangles
-    top = triangles[(z[triangles] > size[2] - 1e-9).all(axis=1)]
+    top = triangles[np.isin(triangles, nodes_at(mesh.points, size[2])).all(axis=1)]
     corners = mesh.points[top]
     area = np.linalg.norm(vector_areas(mesh.points, top), axis=1)
     load = np.zeros(mesh.points.size)
-    # Linear shape functions against the cosine, by three points at the middles of the sides.
+    # Linear shape functions times the cosine, by points in the middles of the sides.
     for start, end in ((0, 1), (1, 2), (2, 0)):
         pressure = np.cos(wave * 0.5 * (corners[:, start, 0] + corners[:, end, 0])) * area / 3.0
         for corner in (start, end):
             np.add.at(load, 3 * top[:, corner] + 2, -0.5 * pressure)
-    sides = [np.flatnonzero((place < 1e-9) | (place > length - 1e-9)) for place, length in ((x, size[0]), (y, size[1]))]
-    held = np.unique(
-        np.concatenate([nodal_dofs(sides[0], (0,)), nodal_dofs(sides[1], (1,)), nodal_dofs(np.flatnonzero(z < 1e-9))])
-    )
+    sides = [nodal_dofs(nodes_at(mesh.points, end, axis), (axis,)) for axis in (0, 1) for end in (0.0, size[axis])]
+    held = np.unique(np.concatenate([*sides, nodal_dofs(nodes_at(mesh.points, 0.0))]))
     stiffness = assemble_stiffness(linear_organ(mesh, MODULUS, nu))
     # f . u = p U A / 2 for a displacement U cos(k x).
     amplitude = 2.0 * float(load @ solve_displacement(stiffness, held, 0.0, load)) / (size[0] * size[1])
@@ -240,7 +237,7 @@ def closed_form(ratio: float, nu: float) -> tuple[float, float]:
 
 
 def strain_inside(model: OrganModel, displacement: FloatArray, radius: float) -> FloatArray:
-    """Mean strain of the tets that lie wholly in a sphere of a radius [m], by volume (3, 3)."""
+    """Mean strain by volume of the tets wholly in a sphere of a radius [m], (3, 3)."""
     corners = model.node_rest_position[model.tet_nodes]
     inside = (np.linalg.norm(corners - 0.5 * BODY, axis=2) <= radius + 1e-9).all(axis=1)
     rest = corners[inside, 1:] - corners[inside, :1]
@@ -251,17 +248,14 @@ def strain_inside(model: OrganModel, displacement: FloatArray, radius: float) ->
 
 
 def eshelby(ratios: tuple[float, ...], nu: float, cells: int = 32) -> Iterator[Result]:
-    """Strains in a stiff ball in a large body under uniform strain from afar, for several modulus ratios.
-
-    The body's boundary is displaced affinely; the ball is strained uniformly (Eshelby 1957).
-    """
+    """Uniform strain in a stiff ball in a large body with an affinely displaced boundary (Eshelby 1957)."""
     mesh = box_mesh((BODY,) * 3, (cells,) * 3)
     radius = 0.5 * BODY / REACH
-    found: list[FloatArray] = []
+    shares: list[FloatArray] = []
     for ratio in ratios:
         lesion = Lesion((0.5 * BODY, 0.5 * BODY, 0.5 * BODY), radius, Material(ratio * SOFT, DENSITY, nu))
-        found.append(_strain_shares(mesh, linear_organ(mesh, SOFT, nu, lesions=(lesion,)), radius))
-        for name, expected, (measured, inner) in zip(("shear", "volume"), closed_form(ratio, nu), found[-1].tolist()):
+        shares.append(_strain_shares(mesh, linear_organ(mesh, SOFT, nu, lesions=(lesion,)), radius))
+        for name, expected, (measured, inner) in zip(("shear", "volume"), closed_form(ratio, nu), shares[-1].tolist()):
             yield compare(
                 f"sphere {ratio:g} x as stiff, nu {nu:.2f}, {name} strain inside, {cells}^3 cells", "Eshelby 1957",
                 expected=expected, measured=measured, tolerance=SPHERE_TOLERANCE,
@@ -271,26 +265,26 @@ def eshelby(ratios: tuple[float, ...], nu: float, cells: int = 32) -> Iterator[R
         return
     labels = ("modulus ratio", "strain inside / strain from afar", False)
     for index, name in enumerate(("shear", "volume")):
-        measured = tuple(float(pair[index, 0]) for pair in found)
+        measured = tuple(float(share[index, 0]) for share in shares)
         yield Curve("lesion_strain", f"{name} strain", ratios, measured, *labels)
         expected = tuple(closed_form(ratio, nu)[index] for ratio in ratios)
         yield Curve("lesion_strain", f"Eshelby, {name} strain", ratios, expected, *labels)
 
 
 def _strain_shares(mesh: TetMesh, model: OrganModel, radius: float) -> FloatArray:
-    """Shear and volume strain over those from afar, in the whole sphere and in the inner half of it (2, 2)."""
+    """Shear and volume strain over those from afar, in the whole sphere and in its inner half (2, 2)."""
     boundary, stiffness = np.asarray(mesh.boundary_nodes), assemble_stiffness(model)
     shares: list[list[float]] = []
-    for wanted in (SHEAR, np.eye(3)):
-        value = (model.node_rest_position[boundary] @ wanted).ravel()
+    for afar in (SHEAR, np.eye(3)):
+        value = (model.node_rest_position[boundary] @ afar).ravel()
         moved = solve_displacement(stiffness, nodal_dofs(boundary), value).reshape(-1, 3)
         strains = [strain_inside(model, moved, share * radius) for share in (1.0, 0.5)]
-        shares.append([float((strain * wanted).sum() / (wanted * wanted).sum()) for strain in strains])
+        shares.append([float((strain * afar).sum() / (afar * afar).sum()) for strain in strains])
     return np.array(shares)
 
 
 def anywhere() -> Iterator[Row]:
-    """How much the stiffness that a lesion adds to a sheared block depends on its place within a cell."""
+    """Range of a lesion's part in the stiffness of a sheared block over its places within a cell."""
     size, cells = 0.5 * BODY, 12
     mesh = box_mesh((size,) * 3, (cells,) * 3)
     plain = affine_modulus(mesh, assemble_stiffness(linear_organ(mesh, SOFT)), SHEAR)
@@ -308,12 +302,13 @@ def anywhere() -> Iterator[Row]:
 
 
 def graded_liver() -> Iterator[Row]:
-    """The scene `liver`: nodes against the uniform lattice of the same fine cells, angles, cell over contact radius."""
+    """Scene `liver`: nodes against the uniform lattice of the same fine cells, angles, cell over contact radius."""
     scene = make_scene("liver")
     surface = scene.mesh.surface
     assert surface is not None
-    alike = replace(surface, coarse_cell_size=None, fine_depth=0.0)
-    graded, uniform = (load_anatomy(replace(scene, mesh=MeshSource(surface=one))) for one in (surface, alike))
+    fine_surface = replace(surface, coarse_cell_size=None, fine_depth=0.0)
+    sources = (MeshSource(surface=surface), MeshSource(surface=fine_surface))
+    graded, uniform = (load_anatomy(replace(scene, mesh=source)) for source in sources)
     corners = graded.face.points[graded.face.triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     fine = float((longest <= 2.0**0.5 * surface.cell_size * (1.0 + 1e-9)).mean())

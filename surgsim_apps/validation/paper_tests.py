@@ -1,4 +1,4 @@
-"""Tests A and B of the paper, repeated and drawn: the twisted prism of figure 4, the pressed block of figure 5."""
+"""Tests A and B of the paper: the twisted prism of figure 4, the pressed block of figure 5."""
 
 import math
 from collections.abc import Iterator
@@ -16,6 +16,7 @@ from msdm_core.organ import advance_or_raise, rest_state
 from surgsim_apps.reports.surface_drawing import OrthographicView
 from surgsim_apps.validation.bars import prism, torsion_stiffness
 from surgsim_apps.validation.row import Drawing, Result, compare
+from surgsim_apps.validation.statics import nodes_at
 from surgsim_env.coupling import Simulation
 from surgsim_env.palpation import press
 from surgsim_env.scene import Anatomy, load_anatomy, make_scene
@@ -33,14 +34,14 @@ STROMA, PARENCHYMA, GEL = (0.25, 0.40, 0.80), (0.80, 0.25, 0.25), (0.86, 0.80, 0
 
 @dataclass(frozen=True, eq=False)
 class Deformed:
-    """An organ at the end of a test.
+    """Organ at the end of a test.
 
     Fields:
         anatomy: with the mesh at rest.
         position: of the nodes [m]                                       (n_node, 3)
         load: torque about the axis [N m] or force of the press [N].
         volume_ratio_smallest: of any tet at any time.
-        site: where it is pressed [m], or the prism's middle             (3,)
+        site: of the press [m], or the prism's middle                    (3,)
     """
 
     anatomy: Anatomy
@@ -51,17 +52,17 @@ class Deformed:
 
     @property
     def displacement(self) -> FloatArray:
-        """How far each node has moved [m], shape (n_node,)."""
+        """Distance of each node from rest [m], shape (n_node,)."""
         return np.linalg.norm(self.position - self.anatomy.mesh.points, axis=1)
 
 
 def twist_prism(angle: float = TWIST) -> Deformed:
-    """Test A: turn the top of the prism slowly about its axis with the bottom held, then wait until it is at rest."""
+    """Test A: the top of the prism turned slowly about its axis with the bottom held, then at rest."""
     anatomy = load_anatomy(make_scene("agarose_prism"))
     model = anatomy.organ()
     rest = model.node_rest_position
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    top = np.flatnonzero(rest[:, 2] > rest[:, 2].max() - 1e-9)
+    top = nodes_at(rest, rest[:, 2].max())
     arm = rest[top, :2] - middle[:2]
     state = rest_state(model)
     dt = 0.5 * model.stable_step
@@ -77,22 +78,23 @@ def twist_prism(angle: float = TWIST) -> Deformed:
 
 
 def press_block() -> Deformed:
-    """Test B: press the block of bovine liver in the middle of its upper side, to the scene's depth."""
+    """Test B: the block of bovine liver pressed in the middle of its upper side to the scene's depth."""
     anatomy = load_anatomy(make_scene("bovine_liver_block"))
     simulation = Simulation(anatomy)
     upper = anatomy.mesh.points.max(axis=0)
     site = upper * np.array([0.5, 0.5, 1.0])
     simulation.reset(anatomy.organ(), site + np.array([0.0, 0.0, 0.1]))
-    done = press(simulation, site, np.array([0.0, 0.0, 1.0]))
-    if done.end:
-        raise ValueError(f"test B ended early: {done.end}")
-    return Deformed(anatomy, simulation.organ_state.node_position.copy(), done.force, done.volume_ratio_smallest, site)
+    pressed = press(simulation, site, np.array([0.0, 0.0, 1.0]))
+    if pressed.end:
+        raise ValueError(f"test B ended early: {pressed.end}")
+    position = simulation.organ_state.node_position.copy()
+    return Deformed(anatomy, position, pressed.force, pressed.volume_ratio_smallest, site)
 
 
 def settling(pressed: Deformed) -> tuple[FloatArray, FloatArray]:
-    """Of the nodes of the upper side: distance from the press [m] and displacement over that of the nearest one."""
+    """Distance of the upper side's nodes from the press [m], and their displacement over the nearest node's."""
     points = pressed.anatomy.mesh.points
-    upper = np.flatnonzero(points[:, 2] > points[:, 2].max() - 1e-9)
+    upper = nodes_at(points, points[:, 2].max())
     distance = np.linalg.norm(points[upper] - pressed.site, axis=1)
     order = np.argsort(distance, kind="stable")
     moved = pressed.displacement[upper][order]
@@ -100,7 +102,7 @@ def settling(pressed: Deformed) -> tuple[FloatArray, FloatArray]:
 
 
 def run_test_a() -> Iterator[Result]:
-    """The prism's torque at a small angle against the assembled matrix, and figure 4."""
+    """Torque of the prism at a small angle against the assembled matrix, and figure 4."""
     small = math.radians(5.0)
     yield compare(
         "test A, torque per angle at 5 degrees", "matrix assembled apart, solved by CG",
@@ -116,7 +118,7 @@ def run_test_a() -> Iterator[Result]:
 
 
 def run_test_b() -> Iterator[Result]:
-    """The share of the press that the block's far part moves by, and figure 5."""
+    """Displacement of the block's far part over that beside the press, and figure 5."""
     pressed = press_block()
     distance, share = settling(pressed)
     depth = pressed.anatomy.scene.palpation.press_depth
@@ -137,7 +139,7 @@ def run_test_b() -> Iterator[Result]:
 
 
 def oblique(azimuth_deg: float, elevation_deg: float) -> OrthographicView:
-    """The view from an azimuth about z (0 is from +x) and an elevation [degrees]."""
+    """View from an azimuth about z (0 is from +x) and an elevation [degrees]."""
     a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
     eye = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
@@ -152,7 +154,7 @@ def draw_triangles(
     *,
     wire: bool = False,
 ) -> None:
-    """Triangles (n, 3, 3) [m] from back to front, shaded, or as their edges only."""
+    """Draw triangles (n, 3, 3) [m] from back to front, shaded, or as wires."""
     from matplotlib.collections import PolyCollection
 
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -173,7 +175,7 @@ def draw_triangles(
 
 
 def write_figure_4(twisted: Deformed, path: Path) -> None:
-    """The prism twisted, as a wireframe and as a body."""
+    """Draw the twisted prism as a wireframe and as a body."""
     from matplotlib.figure import Figure
 
     mesh = twisted.anatomy.mesh
@@ -194,7 +196,7 @@ def write_figure_4(twisted: Deformed, path: Path) -> None:
 
 
 def write_figure_5(pressed: Deformed, path: Path) -> None:
-    """The block cut open to show its layer of stroma, pressed, and how its upper side moves away from the press."""
+    """Draw the block cut open with its layer of stroma, pressed, and the displacement of its upper side."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
@@ -227,7 +229,7 @@ def write_figure_5(pressed: Deformed, path: Path) -> None:
 
 
 def _faces(tets: IntArray) -> tuple[IntArray, NDArray[np.intp], NDArray[np.intp]]:
-    """Every face of every tet once, outward from the first tet that has it (n, 3), that tet, and how many have it."""
+    """Faces of tets, outward from their first tet (n, 3), that tet, and the number of tets with the face."""
     faces = tets[:, TET_FACES].reshape(-1, 3)
     _, first, uses = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first], first // 4, uses

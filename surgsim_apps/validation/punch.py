@@ -1,4 +1,4 @@
-"""A flat punch on a bonded layer: Hayes' solution, and how much a hidden sphere changes the force.
+"""Flat punch on a bonded layer: Hayes' solution, and the contrast of a hidden sphere.
 
 The layer consists of cells of one size, or is fine in its upper third and coarse below.
 """
@@ -19,6 +19,7 @@ from surgsim_apps.validation.statics import (
     assemble_stiffness,
     linear_organ,
     nodal_dofs,
+    nodes_at,
     solve_displacement,
     twice_energy,
 )
@@ -38,7 +39,7 @@ GRADED_TOLERANCE = 0.05
 
 @dataclass(frozen=True)
 class Hidden:
-    """A sphere under the punch: modulus ratio, cover [m] and radius [m]."""
+    """Sphere under the punch: modulus ratio, cover [m] and radius [m]."""
 
     ratio: float
     cover: float
@@ -46,7 +47,7 @@ class Hidden:
 
     @property
     def name(self) -> str:
-        """The sphere in the names of rows."""
+        """Name of the sphere in rows."""
         return f"{self.ratio:g} x, cover {1e3 * self.cover:g} mm, radius {1e3 * self.radius:g} mm"
 
 
@@ -62,7 +63,7 @@ def block_stiffness(cells: int, nu: float, hidden: Hidden | None = None) -> floa
 
 
 def pressed(mesh: TetMesh, nu: float, hidden: Hidden | None = None) -> float:
-    """The same of any mesh of the block."""
+    """Force per depth of the punch on a mesh of the block [N/m]."""
     lesions: tuple[Lesion, ...] = ()
     if hidden is not None:
         centre = (0.03, 0.03, SIZE[2] - hidden.cover - hidden.radius)
@@ -70,7 +71,7 @@ def pressed(mesh: TetMesh, nu: float, hidden: Hidden | None = None) -> float:
     stiffness = assemble_stiffness(linear_organ(mesh, MODULUS, nu, lesions=lesions))
     x, y, z = mesh.points.T
     under = np.flatnonzero((z > SIZE[2] - 1e-9) & (np.hypot(x - 0.03, y - 0.03) <= RADIUS + 1e-9))
-    floor = nodal_dofs(np.flatnonzero(z < 1e-9))
+    floor = nodal_dofs(nodes_at(mesh.points, 0.0))
     held = np.concatenate([floor, nodal_dofs(under, (2,))])
     value = np.repeat([0.0, -1.0], [len(floor), len(under)])
     return twice_energy(stiffness, solve_displacement(stiffness, held, value))
@@ -78,7 +79,7 @@ def pressed(mesh: TetMesh, nu: float, hidden: Hidden | None = None) -> float:
 
 @lru_cache(maxsize=8)
 def reference_layer(modulus: float, nu: float, hidden: Hidden | None = None, radius: float = DISC) -> Elements:
-    """The layer in axisymmetric quadratic elements, homogeneous or over a sphere, as a disc of a radius [m]."""
+    """Layer in axisymmetric quadratic elements, homogeneous or over a sphere, as a disc of a radius [m]."""
     return layer(radius, SIZE[2], modulus_field(modulus, hidden), nu)
 
 
@@ -96,7 +97,7 @@ def modulus_field(modulus: float, hidden: Hidden | None) -> Callable[[FloatArray
 
 @lru_cache(maxsize=32)
 def reference_stiffness(nu: float, hidden: Hidden | None = None) -> float:
-    """Force per depth of the punch by these elements [N/m]."""
+    """Force per depth of the punch by axisymmetric elements [N/m]."""
     return punch_stiffness(reference_layer(MODULUS, nu, hidden), RADIUS)
 
 
@@ -113,7 +114,7 @@ def hayes(counts: tuple[int, ...]) -> Iterator[Row]:
 
 
 def reference_check() -> Iterator[Row]:
-    """The reference elements of contrasts and ball against Hayes, on a disc so wide that its rim does not matter."""
+    """Reference elements of contrasts and ball against Hayes, on a wide disc without influence of its rim."""
     for nu, expected in HAYES.items():
         yield compare(
             f"reference elements for the punch, nu {nu:.2f}", "Hayes 1972, bonded layer", expected=expected,
@@ -123,27 +124,27 @@ def reference_check() -> Iterator[Row]:
 
 
 def contrast(count: int, nu: float, hidden: tuple[Hidden, ...], curve: str = "") -> Iterator[Result]:
-    """Force with the sphere over force without it, less 1; where cell <= radius / 2 and cell <= cover."""
+    """Force with the sphere over force without it, less 1; for cell <= radius / 2 and cell <= cover."""
     cell = SIZE[0] / count
     rows: list[Row] = []
-    for one in hidden:
-        assert cell <= one.radius / 2.0 + 1e-9 and cell <= one.cover + 1e-9
+    for sphere in hidden:
+        assert cell <= sphere.radius / 2.0 + 1e-9 and cell <= sphere.cover + 1e-9
         row = compare(
-            f"contrast, {one.name}, nu {nu:.2f}, cell {1e3 * cell:.1f} mm", "scikit-fem, axisymmetric",
-            expected=reference_stiffness(nu, one) / reference_stiffness(nu) - 1.0,
-            measured=block_stiffness(count, nu, one) / block_stiffness(count, nu) - 1.0,
+            f"contrast, {sphere.name}, nu {nu:.2f}, cell {1e3 * cell:.1f} mm", "scikit-fem, axisymmetric",
+            expected=reference_stiffness(nu, sphere) / reference_stiffness(nu) - 1.0,
+            measured=block_stiffness(count, nu, sphere) / block_stiffness(count, nu) - 1.0,
             tolerance=CONTRAST_TOLERANCE,
         )  # fmt: skip
         rows.append(row)
     yield from rows
     if curve:
-        covers, labels = tuple(1e3 * one.cover for one in hidden), ("cover [mm]", "contrast, k / k0 - 1", False)
+        covers, labels = tuple(1e3 * sphere.cover for sphere in hidden), ("cover [mm]", "contrast, k / k0 - 1", False)
         yield Curve(curve, f"springs, nu {nu:.2f}", covers, tuple(row.measured for row in rows), *labels)
         yield Curve(curve, f"reference, nu {nu:.2f}", covers, tuple(row.expected for row in rows), *labels)
 
 
 def graded_punch() -> Iterator[Row]:
-    """The punch on a layer that is fine in its upper third: its force, and a hidden sphere's contrast."""
+    """Punch on a layer with a fine upper third: its force, and the contrast of a hidden sphere."""
     counts = (GRADED_CELLS, GRADED_CELLS, GRADED_CELLS // 2)
     mesh, hidden = box_mesh(SIZE, counts, coarsening=2, fine_depth=GRADED_DEPTH), Hidden(5.0, 0.004, 0.005)
     for nu, expected in HAYES.items():

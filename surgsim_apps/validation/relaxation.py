@@ -1,4 +1,4 @@
-"""Springs that relax: closed forms of step strain and creep, and exact steps of a quasi-linear viscoelastic body.
+"""Relaxing springs: closed forms of step strain and creep, and exact steps of a quasi-linear viscoelastic body.
 
 Fung's quasi-linear law with Maxwell arms, on the springs alone: T = T_e + sum g_i q_i, dq_i/dt = dT_e/dt - q_i / tau_i.
 With r_i = T_e - q_i this is T = (1 + sum g_i) T_e - sum g_i r_i, dr_i/dt = (T_e - r_i) / tau_i. At small strain T_e is
@@ -17,22 +17,22 @@ from msdm_core.mesh import FloatArray
 
 
 def spring_creep(arms: Relaxation, time: FloatArray) -> FloatArray:
-    """Strain of springs under a constant load over the final one, of times [s], shape (n,).
+    """Strain of springs under a constant load over the final strain, at times [s], shape (n,).
 
     (1 + sum g) u - sum g_i u_i = 1, du_i/dt = (u - u_i) / tau_i, u_i = 0 at 0.
     """
     shares, times = np.asarray(arms.relative_moduli), np.asarray(arms.times)
-    # u = first + taken (u_1, u_2, ...): a linear equation for the arms alone.
+    # u = first + weights (u_1, u_2, ...): a linear equation for the arms alone.
     first = 1.0 / (1.0 + shares.sum())
-    taken, still = first * shares, np.eye(len(times))
-    rate, drive = (taken - still) / times[:, None], first / times
-    strains = [taken @ np.linalg.solve(rate, (expm(rate * moment) - still) @ drive) for moment in time]
+    weights, identity = first * shares, np.eye(len(times))
+    rate, drive = (weights - identity) / times[:, None], first / times
+    strains = [weights @ np.linalg.solve(rate, (expm(rate * moment) - identity) @ drive) for moment in time]
     return first + np.array(strains)
 
 
 @dataclass(eq=False)
 class ViscoelasticBody:
-    """A body at small strain whose springs relax, stepped exactly for displacements that are linear within a step.
+    """Body of relaxing springs at small strain, stepped exactly for displacements linear within a step.
 
     Over a step h: u_i <- a u_i + (1 - b) u_new + (b - a) u_old, a = exp(-h / tau), b = (1 - a) tau / h.
 
@@ -54,7 +54,7 @@ class ViscoelasticBody:
         self.arm_displacement = np.zeros((len(self.arms.times), count))
 
     def step(self, duration: float) -> tuple[csc_array, FloatArray]:
-        """Stiffness K and load f [N] of the step's end: the body's forces there are K u - f."""
+        """Stiffness K and load f [N] at the end of a step: the body's forces are K u - f."""
         decay, rise = self._factors(duration)
         shares = np.asarray(self.arms.relative_moduli)
         stiffness = csc_array((1.0 + shares @ rise) * self.springs + self.volume)

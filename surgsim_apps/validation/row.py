@@ -13,17 +13,17 @@ Verdict = Literal["met", "not met", "skipped"]
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table.
+    """Line of the table.
 
     Args:
-        case: its name, one of a kind.
-        source: where the expected value comes from.
+        case: its name, unique.
+        source: of the expected value.
         expected, measured: in `unit`.
         error: of the measured value, relative unless `absolute`.
         tolerance: largest size of the error.
         verdict: "met", "not met" or "skipped".
         unit: SI, empty for a ratio.
-        absolute: whether error and tolerance are in `unit` instead of shares of the expected value.
+        absolute: true for error and tolerance in `unit` instead of shares of the expected value.
         note: remark for the reader of the table.
     """
 
@@ -41,7 +41,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Curve:
-    """A line of a plot: `figure` is the plot's name, `label` the line's."""
+    """Line of a plot; `figure` is the plot's name."""
 
     figure: str
     label: str
@@ -54,7 +54,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture that a case draws itself: file name without suffix, caption, and a function that draws it to a path."""
+    """Picture of a case: file name without suffix, caption, and a function to draw it to a path."""
 
     name: str
     caption: str
@@ -66,7 +66,7 @@ Result = Row | Curve | Drawing
 
 @dataclass(frozen=True)
 class Case:
-    """A named computation; a quick run leaves out `slow` ones; `needs_fem` ones need scikit-fem."""
+    """Named computation; `slow` ones are left out of a quick run, `needs_fem` ones need scikit-fem."""
 
     name: str
     run: Callable[[], Iterable[Result]]
@@ -85,7 +85,7 @@ def compare(
     absolute: bool = False,
     note: str = "",
 ) -> Row:
-    """A row whose verdict follows from its error and tolerance; a number that is not finite is not met."""
+    """Row with the verdict by error and tolerance; a number that is not finite is not met."""
     error = measured - expected if absolute else measured / expected - 1.0
     verdict: Verdict = "met" if math.isfinite(error) and abs(error) <= tolerance else "not met"
     return Row(case, source, expected, measured, error, tolerance, verdict, unit, absolute, note)
@@ -101,7 +101,7 @@ def bounded(
     unit: str = "",
     note: str = "",
 ) -> Row:
-    """A row whose measured value has a bound on one side, shown as what is expected."""
+    """Row with a bound of the measured value on one side, shown as expected."""
     bound = least if math.isfinite(least) else most
     verdict: Verdict = "met" if least <= measured <= most else "not met"
     side = "verdict: at least that" if math.isfinite(least) else "verdict: at most that"
@@ -110,9 +110,9 @@ def bounded(
 
 
 def with_order(name: str, sizes: list[float], rows: list[Row]) -> Iterator[Result]:
-    """Rows of meshes from coarse to fine, the curve of their errors, a row that is met if the error falls on each one.
+    """Rows of meshes from coarse to fine, the curve of their errors, and a row for their order.
 
-    That row shows the p of |error| = C size^p, by least squares of the logarithms.
+    It shows p of |error| = C size^p, by least squares of the logarithms, and is met if every finer mesh has less error.
     """
     errors = np.array([abs(row.error) for row in rows])
     order = float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])

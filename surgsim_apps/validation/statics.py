@@ -1,4 +1,4 @@
-"""The organ linearised at rest as a sparse matrix, assembled independently of the kernels, and its solution."""
+"""Stiffness matrix of an organ at rest, assembled independently of the kernels, and solutions with it."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,10 +35,7 @@ def assemble_stiffness(model: OrganModel) -> csr_array:
     """
     points = model.node_rest_position
     count = points.size
-    span = points[model.spring_nodes[:, 1]] - points[model.spring_nodes[:, 0]]
-    direction = span / np.linalg.norm(span, axis=1)[:, None]
-    springs = np.concatenate([-direction, direction], axis=1) * np.sqrt(model.spring_stiffness)[:, None]
-    matrix = outer_products(model.spring_nodes, springs, count)
+    matrix = spring_matrix(points, model.spring_nodes, model.spring_stiffness)
     gradient = volume_gradient(points, model.tet_nodes)
     by_tet = gradient * np.sqrt(model.tet_bulk / model.tet_rest_volume)[:, None]
     matrix = matrix + outer_products(model.tet_nodes, by_tet, count)
@@ -46,6 +43,14 @@ def assemble_stiffness(model: OrganModel) -> csr_array:
         averaged = averaged_gradient(model.tet_nodes, gradient, count)
         matrix = matrix + averaged.T @ averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
     return matrix
+
+
+def spring_matrix(points: FloatArray, nodes: NDArray[np.int32], stiffness: FloatArray) -> csr_array:
+    """sum_s k n n^T [N/m] of springs between nodes (n, 2) of stiffness (n,) [N/m], (3 n_node, 3 n_node)."""
+    span = points[nodes[:, 1]] - points[nodes[:, 0]]
+    direction = span / np.linalg.norm(span, axis=1)[:, None]
+    ends = np.concatenate([-direction, direction], axis=1) * np.sqrt(stiffness)[:, None]
+    return outer_products(nodes, ends, points.size)
 
 
 def volume_gradient(points: FloatArray, tets: NDArray[np.int32]) -> FloatArray:
@@ -64,7 +69,7 @@ def averaged_gradient(tets: NDArray[np.int32], gradient: FloatArray, count: int)
 
 
 def outer_products(nodes: NDArray[np.int32], vectors: FloatArray, count: int) -> csr_array:
-    """Sum of v v^T over items with the given nodes, v listing three components a node."""
+    """Sum of v v^T over items with the given nodes, with three components of v a node."""
     return block_sum(vectors[:, :, None] * vectors[:, None, :], node_rows(nodes), count).tocsr()
 
 
@@ -80,17 +85,22 @@ def node_rows(nodes: NDArray[np.int32]) -> NDArray[np.int64]:
     return (3 * nodes[:, :, None].astype(np.int64) + np.arange(3)).reshape(len(nodes), -1)
 
 
+def nodes_at(points: FloatArray, height: float, axis: int = 2) -> NDArray[np.intp]:
+    """Nodes at a height along an axis [m]."""
+    return np.flatnonzero(np.abs(points[:, axis] - height) < 1e-9)
+
+
 def nodal_dofs(nodes: ArrayLike, axes: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.int64]:
-    """Rows of the matrix that belong to some nodes' axes, node by node."""
+    """Rows of the axes of nodes, node by node."""
     return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.asarray(axes)).ravel()
 
 
 def solve_displacement(
     stiffness: csr_array, held: NDArray[np.int64], value: ArrayLike = 0.0, load: FloatArray | None = None
 ) -> FloatArray:
-    """The u with K u = load where it is free and u = value where it is held (Jacobi-preconditioned CG).
+    """Solution u of K u = load at free rows, with u = value at held ones (Jacobi-preconditioned CG).
 
-    Free rigid motions do no harm, as long as the load does no work on them.
+    Free rigid motions do no harm if the load does no work on them.
     """
     count = len(stiffness.indptr) - 1
     displacement = np.zeros(count)
@@ -101,22 +111,21 @@ def solve_displacement(
         right += load[free]
     inner = csr_array(stiffness[free][:, free])
     jacobi = diags_array(1.0 / np.asarray(inner.diagonal(), dtype=np.float64))
-    found, code = cg(inner, right, rtol=RESIDUAL, maxiter=20000, M=jacobi)
+    solution, code = cg(inner, right, rtol=RESIDUAL, maxiter=20000, M=jacobi)
     if code != 0:
         raise ValueError(f"the linear solution did not converge in {code} iterations")
-    displacement[free] = found
+    displacement[free] = solution
     return displacement
 
 
 def twice_energy(stiffness: csr_array, displacement: FloatArray) -> float:
-    """The product u . K u [J]; for a unit displacement of what is held this is its stiffness."""
+    """Product u . K u [J]; for a unit displacement of held rows their stiffness."""
     return float(displacement @ (stiffness @ displacement))
 
 
 def pull_stiffness(mesh: TetMesh, stiffness: csr_array, axis: int = 2) -> float:
-    """Force per elongation along an axis of a block whose two ends slide freely [N/m]."""
-    place = mesh.points[:, axis]
-    low, high = np.flatnonzero(place < 1e-9), np.flatnonzero(place > place.max() - 1e-9)
+    """Force per elongation along an axis of a block with freely sliding ends [N/m]."""
+    low, high = (nodes_at(mesh.points, height, axis) for height in (0.0, mesh.points[:, axis].max()))
     held = nodal_dofs(np.concatenate([low, high]), (axis,))
     value = np.repeat([0.0, 1.0], [len(low), len(high)])
     return twice_energy(stiffness, solve_displacement(stiffness, held, value))

@@ -1,4 +1,4 @@
-"""Every case in the order of the table, their run, and its verdict against the list of known shortfalls."""
+"""Cases in the order of the table, their run, and its verdict against the list of known shortfalls."""
 
 import math
 import tomllib
@@ -62,8 +62,13 @@ CASES: tuple[Case, ...] = (
     Case("touch, 0.70", partial(touch.sites, 12, 0.010, 0.0051, 100, 0.20, 0.01, 0.04), slow=True, needs_fem=True),
     Case("touch, 0.50", partial(touch.sites, 20, 0.008, 0.0045, 8, 0.10, None, None), slow=True, needs_fem=True),
     *(
-        Case(f"touch, contrast, {one.name}, {cells}", partial(touch.contrast, cells, one), slow=True, needs_fem=True)
-        for cells, one in touch.CONTRASTS
+        Case(
+            f"touch, contrast, {lesion.name}, {cells}",
+            partial(touch.contrast, cells, lesion),
+            slow=True,
+            needs_fem=True,
+        )
+        for cells, lesion in touch.CONTRASTS
     ),
     Case("liver, contrast", touch.liver_contrast, slow=True, needs_fem=True),
     Case("large strain, linear", partial(tissue_law.large_strain, "slide", 6, None)),
@@ -90,7 +95,7 @@ SHORTFALLS = Path(__file__).with_name("known_shortfalls.toml")
 
 @dataclass(frozen=True)
 class Shortfall:
-    """A known shortfall: why a case is not met, and the largest error for which that reason holds."""
+    """Known shortfall: reason of a case that is not met, and the largest error for that reason."""
 
     reason: str
     error: float
@@ -98,7 +103,7 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Validation:
-    """Results of a run: rows, curves and drawings of its cases, whether it was the quick subset, known shortfalls."""
+    """Results of a run: rows, curves and drawings of its cases, true for the quick subset, known shortfalls."""
 
     rows: tuple[Row, ...]
     curves: tuple[Curve, ...]
@@ -107,27 +112,27 @@ class Validation:
     shortfalls: dict[str, Shortfall]
 
     def is_known(self, row: Row) -> bool:
-        """Whether a row that is not met is listed, and no worse than listed."""
+        """True for a row that is not met, listed, and no worse than listed."""
         listed = self.shortfalls.get(row.case)
         return listed is not None and row.verdict == "not met" and abs(row.error) <= listed.error
 
     @property
     def unexplained(self) -> list[Row]:
-        """Rows that are not met and not listed, or worse than listed."""
+        """Rows not met and not listed, or worse than listed."""
         return [row for row in self.rows if row.verdict == "not met" and not self.is_known(row)]
 
     @property
     def outdated(self) -> list[str]:
-        """Cases that are listed as shortfalls but met."""
+        """Met cases among the listed shortfalls."""
         return [row.case for row in self.rows if row.verdict == "met" and row.case in self.shortfalls]
 
     @property
     def passed(self) -> bool:
-        """Whether every row is met, skipped or a known shortfall."""
+        """True if every row is met, skipped or a known shortfall."""
         return not self.unexplained
 
     def reason(self, row: Row) -> str:
-        """The row's note, after the reason of its shortfall where it is a known one."""
+        """Note of a row, after the reason of a known shortfall."""
         known = self.shortfalls[row.case].reason if self.is_known(row) else ""
         return "; ".join(part for part in (known, row.note) if part)
 
@@ -135,21 +140,22 @@ class Validation:
 def load_shortfalls() -> dict[str, Shortfall]:
     """Known shortfalls by the case's name."""
     table = tomllib.loads(SHORTFALLS.read_text(encoding="utf-8"))
-    found: dict[str, Shortfall] = {}
-    for entry in table["shortfall"]:
-        found.update({case: Shortfall(entry["reason"], error) for case, error in entry["cases"].items()})
-    return found
+    return {
+        case: Shortfall(entry["reason"], error)
+        for entry in table["shortfall"]
+        for case, error in entry["cases"].items()
+    }
 
 
 def run_case(case: Case) -> list[Result]:
-    """The results of one case, or a row with the reason why it was left out."""
+    """Results of a case, or a skipped row with the reason."""
     if case.needs_fem and not has_fem():
         return [Row(case.name, "scikit-fem", math.nan, math.nan, math.nan, math.nan, "skipped", note=MISSING)]
     return list(case.run())
 
 
 def run_cases(*, quick: bool, console: Console, cases: Sequence[Case] = CASES) -> Validation:
-    """Run the cases (without the slow ones for a quick run) with a progress bar."""
+    """Run the cases, for a quick run without the slow ones, with a progress bar."""
     shortfalls = load_shortfalls()
     chosen = [case for case in cases if not (quick and case.slow)]
     columns = (TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -160,7 +166,7 @@ def run_cases(*, quick: bool, console: Console, cases: Sequence[Case] = CASES) -
             progress.update(task, description=case.name)
             results += run_case(case)
             progress.advance(task)
-    rows = tuple(one for one in results if isinstance(one, Row))
-    curves = tuple(one for one in results if isinstance(one, Curve))
-    drawings = tuple(one for one in results if isinstance(one, Drawing))
+    rows = tuple(result for result in results if isinstance(result, Row))
+    curves = tuple(result for result in results if isinstance(result, Curve))
+    drawings = tuple(result for result in results if isinstance(result, Drawing))
     return Validation(rows, curves, drawings, quick, shortfalls)

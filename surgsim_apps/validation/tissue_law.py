@@ -1,7 +1,7 @@
-"""Springs that stiffen and relax: blocks at large strain, a step strain, creep under a weight, a press that is held.
+"""Stiffening and relaxing springs: blocks at large strain, a step strain, creep under a weight, a held press.
 
-At large strain the organ is compared with the continuum of its own springs. These have the seven directions of a BCC
-lattice, a quadrature of degree 5 of springs in all directions (`all_directions`).
+The reference at large strain is the continuum of the organ's springs, in the seven directions of a BCC lattice: a
+quadrature of degree 5 of springs in all directions (`all_directions`).
 """
 
 from collections.abc import Iterator
@@ -29,14 +29,14 @@ from surgsim_apps.validation.hyperelastic import OrganBlock, Plates, QuadraticBl
 from surgsim_apps.validation.punch import reference_layer
 from surgsim_apps.validation.relaxation import ViscoelasticBody, spring_creep
 from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
-from surgsim_apps.validation.statics import DENSITY, assemble_stiffness, nodal_dofs
+from surgsim_apps.validation.statics import DENSITY, assemble_stiffness, nodal_dofs, nodes_at
 from surgsim_apps.validation.touch import PRESS_SPEED, STEP, BallOnOrgan, ball, phantom
 from surgsim_env.scene import load_anatomy, make_scene
 
 MODULUS = 5e3  # [Pa]
 RATIO = 0.45
 SIZE = (0.04, 0.04, 0.04)  # [m]
-# As identified for pig liver, where springs stiffen most.
+# As identified for pig liver, with the steepest stiffening.
 STIFFENING = Stiffening(onset_strain=0.06, cap_strain=0.16, tangent_cap=30.0)
 ARMS = Relaxation(relative_moduli=(0.3, 0.3, 0.3), times=(0.05, 0.5, 5.0))
 LARGEST = 0.4
@@ -53,41 +53,41 @@ SPEED, REST, ALPHA = 1.0, 0.15, 300.0
 
 
 def solid_of(material: Material, *, lattice: bool = True) -> SpringSolid:
-    """The continuum of a material's springs, with the directions of the lattice or all."""
+    """Continuum of a material's springs, in the directions of the lattice or all."""
     shear_modulus = material.youngs_modulus / (2.0 * (1.0 + material.poisson_ratio))
     directions = lattice_directions() if lattice else sphere_directions()
     return SpringSolid(shear_modulus, material.volume_modulus, material.stiffening, directions)
 
 
 def free_block_forces(cells: int, material: Material, strains: tuple[float, ...]) -> list[float]:
-    """Force on the end of a cube with free sides, drawn apart to some strains [N], in static equilibrium."""
+    """Forces on the end of a cube with free sides, drawn apart to strains [N], in static equilibrium."""
     mesh = box_mesh(SIZE, (cells,) * 3)
     return OrganBlock(mesh, compile_organ(OrganSpec(mesh, material)), material.stiffening).forces("slide", strains)
 
 
 def bonded_block_forces(cells: int, material: Material, test: Test, strains: tuple[float, ...]) -> list[float]:
-    """Force on the upper end of a cube with bonded ends [N], which are moved and come to rest at each strain."""
+    """Forces on the upper end of a cube with bonded ends [N], moved to strains and at rest there."""
     mesh = box_mesh(SIZE, (cells,) * 3)
     plates = Plates.of(mesh.points, test)
     ends, direction = plates.held.reshape(-1, 3)[:, 0] // 3, plates.direction.reshape(-1, 3)
     model = compile_organ(OrganSpec(mesh, material, anchors=ends, damping=Damping(alpha=ALPHA)))
-    state, before, found = blank_state(model), 0.0, []
+    state, before, forces = blank_state(model), 0.0, []
     for strain in strains:
         count = max(1, round(abs(strain - before) / (SPEED * STEP)))
-        for one in np.linspace(before, strain, count + 1)[1:]:
-            state.node_position[ends] = model.node_rest_position[ends] + one * direction
-            advanced(model, state, STEP)
-        advanced(model, state, REST)
-        found.append(float(-state.node_force.ravel()[plates.loaded].sum()))
+        for target in np.linspace(before, strain, count + 1)[1:]:
+            state.node_position[ends] = model.node_rest_position[ends] + target * direction
+            advance_freely(model, state, STEP)
+        advance_freely(model, state, REST)
+        forces.append(float(-state.node_force.ravel()[plates.loaded].sum()))
         before = strain
-    return found
+    return forces
 
 
 def large_strain(test: Test, cells: int, stiffening: Stiffening | None) -> Iterator[Result]:
     """Tension and compression, or shear, of a cube to 40 % against the continuum of its springs.
 
-    A cube with free sides is deformed homogeneously (closed form); with bonded ends the reference is by quadratic
-    hexahedra. Stiffening springs are compressed to COMPRESSED: see `ellipticity`.
+    The reference is a closed form for free sides, quadratic hexahedra for bonded ends. Stiffening springs are
+    compressed to COMPRESSED alone: see `ellipticity`.
     """
     material = Material(MODULUS, DENSITY, RATIO, stiffening=stiffening)
     solid, law = solid_of(material), "linear" if stiffening is None else "stiffening"
@@ -96,7 +96,7 @@ def large_strain(test: Test, cells: int, stiffening: Stiffening | None) -> Itera
     signs = {"sheared": 1.0} if test == "shear" else {"pulled": 1.0, "compressed": -1.0}
     for name, sign in signs.items():
         most = COMPRESSED if stiffening is not None and sign < 0.0 else LARGEST
-        shown = [one for one in (0.5 * cap, 0.75 * cap, cap, most) if one <= most]
+        shown = [strain for strain in (0.5 * cap, 0.75 * cap, cap, most) if strain <= most]
         sizes = np.unique(np.round([*np.arange(STRAIN_STEP, most + 1e-9, STRAIN_STEP), *shown], 6))
         signed = tuple((sign * sizes).tolist())
         source = "springs as a continuum"
@@ -120,32 +120,32 @@ def large_strain(test: Test, cells: int, stiffening: Stiffening | None) -> Itera
 
 
 def ellipticity() -> Iterator[Row]:
-    """Compression along an axis at which the continuum of the lattice loses ellipticity, against where the cap begins.
+    """Compression along an axis at the loss of ellipticity of the lattice's continuum, against the begin of the cap.
 
     From there on the acoustic tensor A_ijkl N_j N_l has a negative eigenvalue for a direction N: columns of steep
-    springs under compression buckle, in waves as short as the cells allow.
+    springs under compression buckle, in waves as short as cells.
     """
     material = Material(MODULUS, DENSITY, RATIO, stiffening=STIFFENING)
-    normals, found = sphere_directions(24)[0], {}
+    normals, limits = sphere_directions(24)[0], {}
     for name, solid in (("lattice", solid_of(material)), ("all", solid_of(material, lattice=False))):
-        found[name] = LARGEST
+        limits[name] = LARGEST
         for strain in np.arange(0.01, LARGEST, 0.005):
             stretch = np.array([1.0 - strain])
             tensor = solid.tangent(bar_gradient(stretch, stretch_across(solid, stretch)))[0]
             if np.linalg.eigvalsh(np.einsum("ijkl,nj,nl->nik", tensor, normals, normals)).min() < 0.0:
-                found[name] = float(strain)
+                limits[name] = float(strain)
                 break
     yield bounded(
         "compression along an axis at which springs of the lattice buckle", "the strain where the cap begins",
-        measured=found["lattice"], least=STIFFENING.cap_strain,
-        note=f"springs in all directions: at least {found['all']:.2f}; {STIFFENING}",
+        measured=limits["lattice"], least=STIFFENING.cap_strain,
+        note=f"springs in all directions: at least {limits['all']:.2f}; {STIFFENING}",
     )  # fmt: skip
 
 
 def all_directions() -> Iterator[Result]:
     """Springs of the lattice against springs in all directions, pulled and sheared along axes of the lattice.
 
-    The tolerance is that of the organ's block: what the lattice adds to it is a property of the law.
+    The tolerance is that of the organ's block, which has the same directions.
     """
     material = Material(MODULUS, DENSITY, RATIO, stiffening=STIFFENING)
     lattice, isotropic = solid_of(material), solid_of(material, lattice=False)
@@ -164,41 +164,41 @@ def all_directions() -> Iterator[Result]:
                 note=f"{STIFFENING}",
             )  # fmt: skip
     strain, labels = np.linspace(-0.3, 0.3, 31), ("strain", "stress [Pa]", False)
-    for solid, what in ((lattice, "springs of the lattice"), (isotropic, "springs in all directions")):
+    for solid, springs in ((lattice, "springs of the lattice"), (isotropic, "springs in all directions")):
         along, shear = uniaxial_stress(solid, 1.0 + strain), simple_shear_stress(solid, strain)
         for name, stress in (("along an axis", along), ("shear", shear)):
-            yield Curve("stiffening", f"{what}, {name}", tuple(strain.tolist()), tuple(stress.tolist()), *labels)
+            yield Curve("stiffening", f"{springs}, {name}", tuple(strain.tolist()), tuple(stress.tolist()), *labels)
 
 
-def advanced(model: OrganModel, state: OrganState, duration: float) -> None:
-    """Advance an organ that nothing touches by some time [s]."""
+def advance_freely(model: OrganModel, state: OrganState, duration: float) -> None:
+    """Advance an untouched organ by a duration [s]."""
     count = int(np.ceil(duration / (0.9 * model.stable_step)))
     advance_or_raise(model, state, duration / count, count)
 
 
 def step_strain(arms: Relaxation, stiffening: Stiffening | None = None) -> Iterator[Row]:
-    """A cube of springs alone, sheared by 20 % in one step to its elastic equilibrium between plates.
+    """Cube of springs alone, sheared by 20 % in a step to its elastic equilibrium between plates.
 
-    All springs relax by the same factor, so that the equilibrium stays where it is.
+    All springs relax by the same factor, and the equilibrium stays.
     """
     mesh = box_mesh(SIZE, (4, 4, 4))
-    ends = np.flatnonzero((mesh.points[:, 2] < 1e-9) | (mesh.points[:, 2] > SIZE[2] - 1e-9))
-    top = mesh.points[:, 2] > SIZE[2] - 1e-9
+    top = nodes_at(mesh.points, SIZE[2])
+    ends = np.union1d(nodes_at(mesh.points, 0.0), top)
     material = Material(MODULUS, DENSITY, 0.25, stiffening=stiffening)
     # About critical for its first mode of shear, sqrt(G / rho) / (2 h) = 17 Hz.
     spec = OrganSpec(mesh, material, anchors=ends, damping=Damping(alpha=220.0))
     elastic = compile_organ(spec)
-    still = blank_state(elastic)
-    still.node_position[:, 0] += 0.2 * mesh.points[:, 2]
-    advanced(elastic, still, 1.0)
+    start = blank_state(elastic)
+    start.node_position[:, 0] += 0.2 * mesh.points[:, 2]
+    advance_freely(elastic, start, 1.0)
     model = compile_organ(replace(spec, materials=replace(material, relaxation=arms)))
     state, before = blank_state(model), 0.0
-    state.node_position[:] = still.node_position
+    state.node_position[:] = start.node_position
     law = "linear" if stiffening is None else "stiffening"
     for time in TIMES:
-        advanced(model, state, time - before)
+        advance_freely(model, state, time - before)
         before = time
-        force = float(state.node_force[top, 0].sum() / still.node_force[top, 0].sum())
+        force = float(state.node_force[top, 0].sum() / start.node_force[top, 0].sum())
         yield compare(
             f"step strain, {law} springs, after {time:g} s", "1 + sum g exp(-t / tau)",
             expected=float(arms.remaining(time)), measured=force,
@@ -207,38 +207,37 @@ def step_strain(arms: Relaxation, stiffening: Stiffening | None = None) -> Itera
 
 
 def creep(arms: Relaxation, poisson_ratio: float) -> Iterator[Row]:
-    """A cube on its base under a small weight that begins at once: sinking of its top over the elastic one."""
+    """Cube on its base under a sudden small weight: sinking of its top over the elastic sinking."""
     mesh = box_mesh(SIZE, (4, 4, 4))
-    base = np.flatnonzero(mesh.points[:, 2] < 1e-9)
+    base, top = nodes_at(mesh.points, 0.0), nodes_at(mesh.points, SIZE[2])
     material = Material(MODULUS, DENSITY, poisson_ratio, relaxation=arms)
     # About critical for its first mode: sqrt(E / rho) / (4 h) = 14 Hz. A strain of 1e-4 is linear.
     spec = OrganSpec(mesh, material, anchors=base, damping=Damping(alpha=170.0), gravity=(0.0, 0.0, -0.01))
     model = compile_organ(spec)
-    top = mesh.points[:, 2] > SIZE[2] - 1e-9
     free = np.setdiff1d(np.arange(mesh.points.size), nodal_dofs(base))
     springs, volume = spring_and_volume_stiffness(spec)
     weight = (model.node_mass[:, None] * model.gravity).ravel()
     end = np.zeros(mesh.points.size)
     end[free] = solved(csc_array(springs + volume), free, weight[free])
-    sunk = end.reshape(-1, 3)[top, 2].mean()
+    sinking = end.reshape(-1, 3)[top, 2].mean()
     if poisson_ratio == 0.25:
         expected, source = spring_creep(arms, np.array(CREEP_TIMES)), "linear equations of the arms"
     else:
         source = "its matrices, stepped exactly"
         body, expected, before = ViscoelasticBody(springs, volume, arms), [], 0.0
         for time in np.unique([*np.geomspace(1e-4, CREEP_TIMES[-1], 60), *CREEP_TIMES]):
-            stiffness, kept = body.step(time - before)
+            stiffness, load = body.step(time - before)
             displacement = np.zeros_like(end)
-            displacement[free] = solved(stiffness, free, (weight + kept)[free])
+            displacement[free] = solved(stiffness, free, (weight + load)[free])
             body.accept(displacement, time - before)
             before = time
             if time in CREEP_TIMES:
-                expected.append(displacement.reshape(-1, 3)[top, 2].mean() / sunk)
+                expected.append(displacement.reshape(-1, 3)[top, 2].mean() / sinking)
     state, before = blank_state(model), 0.0
     for time, share in zip(CREEP_TIMES, expected, strict=True):
-        advanced(model, state, time - before)
+        advance_freely(model, state, time - before)
         before = time
-        measured = float((state.node_position - model.node_rest_position)[top, 2].mean() / sunk)
+        measured = float((state.node_position - model.node_rest_position)[top, 2].mean() / sinking)
         yield compare(
             f"creep, nu {poisson_ratio:.2f}, after {time:g} s", source, expected=float(share), measured=measured,
             tolerance=RELAXED_TOLERANCE, note="sinking of the top over the elastic one",
@@ -249,43 +248,43 @@ def spring_and_volume_stiffness(spec: OrganSpec) -> tuple[csc_array, csc_array]:
     """Stiffness of an elastic organ's springs and of its volume terms [N/m], (3 n_node, 3 n_node)."""
     assert isinstance(spec.materials, Material)
     model = compile_organ(replace(spec, materials=replace(spec.materials, relaxation=None), gravity=(0.0, 0.0, 0.0)))
-    nothing = {name: np.zeros_like(getattr(model, name)) for name in ("tet_bulk", "tet_averaged_bulk", "node_bulk")}
-    springs = csc_array(assemble_stiffness(model._replace(**nothing, averages_volume=False)))
+    zeros = {name: np.zeros_like(getattr(model, name)) for name in ("tet_bulk", "tet_averaged_bulk", "node_bulk")}
+    springs = csc_array(assemble_stiffness(model._replace(**zeros, averages_volume=False)))
     return springs, csc_array(csc_array(assemble_stiffness(model)) - springs)
 
 
-# The press that is held: ball [m], depth [m], and times after its end [s].
+# Held press: ball [m], depth [m], and times after its end [s].
 TIP, DEPTH = 0.008, 0.002
 HOLD_TIMES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
 
 
 @lru_cache(maxsize=4)
 def reference_press(arms: Relaxation) -> tuple[float, ...]:
-    """Force of the ball at HOLD_TIMES after it was pressed in at PRESS_SPEED [N], by axisymmetric elements."""
+    """Forces of the ball at HOLD_TIMES after a press at PRESS_SPEED [N], by axisymmetric elements."""
     scene = make_scene("phantom")
     modulus, nu = scene.material.youngs_modulus, scene.material.poisson_ratio
     layer = reference_layer(modulus, nu)
-    # Springs are the solid of the same shear modulus and nu 1/4; the volume terms are the rest.
+    # Springs are the solid of the same shear modulus and nu 1/4, volume terms the difference to the layer.
     springs = csc_array(reference_layer(modulus * 1.25 / (1.0 + nu), 0.25).stiffness)
     body = ViscoelasticBody(springs, csc_array(csc_array(layer.stiffness) - springs), arms)
     contact = BallContact(layer, TIP, scene.contact.stiffness)
     ramp = DEPTH / PRESS_SPEED
     held = np.unique([*np.geomspace(0.005, HOLD_TIMES[-1], 22), *HOLD_TIMES[1:]])
     moments = [*np.linspace(0.0, ramp, 11)[1:], *(ramp + held)]
-    displacement, before, found = np.zeros(len(layer.place)), 0.0, []
+    displacement, before, forces = np.zeros(len(layer.place)), 0.0, []
     for moment in moments:
-        stiffness, kept = body.step(moment - before)
+        stiffness, load = body.step(moment - before)
         depth = min(moment * PRESS_SPEED, DEPTH)
-        force = contact.pressed(stiffness, kept, layer.held, displacement, depth)
+        force = contact.pressed(stiffness, load, layer.held, displacement, depth)
         body.accept(displacement, moment - before)
         before = moment
         if np.abs(np.array(HOLD_TIMES) + ramp - moment).min() < 1e-9:
-            found.append(force)
-    return tuple(found)
+            forces.append(force)
+    return tuple(forces)
 
 
 def organ_press(cells: int, arms: Relaxation) -> list[float]:
-    """The same of the phantom [N], without friction, in the middle of its top."""
+    """Forces of the ball at HOLD_TIMES on the phantom [N], without friction, in the middle of its top."""
     scene = phantom(cells)
     scene = replace(scene, material=replace(scene.material, relaxation=arms))
     law = scene.contact.law._replace(friction=0.0)
@@ -297,7 +296,7 @@ def organ_press(cells: int, arms: Relaxation) -> list[float]:
 
 
 def held_press(cells: int) -> Iterator[Result]:
-    """A ball pressed 2 mm into the phantom at 40 mm/s and held for 10 s."""
+    """Ball pressed 2 mm into the phantom at 40 mm/s and held for 10 s."""
     expected, measured = reference_press(ARMS), organ_press(cells, ARMS)
     name = f"press held, cell {60.0 / cells:.1f} mm"
     for time, reference, force in list(zip(HOLD_TIMES, expected, measured, strict=True))[:-1]:

@@ -1,6 +1,6 @@
-"""A ball on the phantom, end to end and with prescribed motion, against axisymmetric finite elements.
+"""Ball on the phantom, moved by the scene's instrument or prescribed, against axisymmetric finite elements.
 
-Indentation by the scene's own instrument; force from site to site, over a lesion and with depth; contact never lets go.
+Force from site to site, over a lesion and with depth; contact in deep presses.
 """
 
 import math
@@ -21,21 +21,22 @@ from msdm_core.organ import OrganSpec, advance_or_raise, compile_organ, rest_sta
 from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh
 from surgsim_apps.validation.punch import DISC, SIZE, Hidden, modulus_field
 from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
+from surgsim_apps.validation.statics import nodes_at
 from surgsim_env.coupling import Simulation
 from surgsim_env.palpation import press
 from surgsim_env.scene import BlockMesh, MeshSource, Scene, hidden_share, load_anatomy, make_scene
 
 REFERENCE = "scikit-fem, axisymmetric, neo-Hookean, rigid tip"
-# Of the instrument's press: tolerances, and sites within a cell of the middle, in cells, so that the mean is over the
-# places of a ball on the lattice.
+# Press by the instrument: tolerances, and sites within a cell of the middle, in cells, for a mean over the places of a
+# ball on the lattice.
 FORCE_TOLERANCE = 0.20
 EXPONENT_TOLERANCE = 0.1
 OFFSETS = ((0.0, 0.0), (0.5, 0.5), (0.5, 0.0), (0.25, 0.25), (0.25, 0.5))
 
-# Elements of the reference [m]: their size, and how far across and down they are that small.
+# Elements of the reference [m]: fine size, and its reach across and down.
 FINE, NEAR = 8e-4, (0.0128, 0.016)
 
-# A slab of the liver's tissue: cells across and down, its sphere, press depths [m], what the mesh may cost as well.
+# Slab of the liver's tissue: cells across and down, its sphere, press depths [m], tolerance with the mesh's part.
 SLAB_COUNT = (16, 10)
 LIVER_SPHERE = Hidden(6.0, 0.005, 0.020)
 LIVER_DEPTHS = (0.003, 0.005, 0.007)
@@ -47,10 +48,10 @@ PRESS_SPEED = 0.04  # [m/s]
 HOLD_COUNT = 150
 # Critical for the block's first shear mode (10 Hz): after the hold the force is static to 1e-4.
 ALPHA = 126.0
-# Sites lie this near to the middle [m]: two cells each way, every place on the lattice alike, 25 mm from the edges.
+# Largest distance of sites from the middle [m]: two cells each way, for all places on the lattice, 25 mm off the edges.
 REACH = 0.005
 CONTRAST_TOLERANCE = 0.15
-# Cells along 6 cm and what is hidden: cell <= radius / 2 and cell <= cover.
+# Cells along 6 cm and hidden sphere: cell <= radius / 2 and cell <= cover.
 CONTRASTS = (
     (12, Hidden(4.0, 0.005, 0.010)),
     (12, Hidden(8.0, 0.005, 0.010)),
@@ -58,12 +59,12 @@ CONTRASTS = (
     (18, Hidden(8.0, 0.005, 0.010)),
     (18, Hidden(8.0, 0.004, 0.008)),
 )
-# Where a ball is pressed in deeply [m].
+# Sites of deep presses [m].
 PLACES = {"a node": (0.03, 0.03), "an edge": (0.0325, 0.03), "a face": (0.03333, 0.03167)}
 
 
 def phantom(cells: int) -> Scene:
-    """The scene `phantom` with `cells` cells along 6 cm and as many substeps as these need."""
+    """Scene `phantom` with `cells` cells along 6 cm and substeps for them."""
     scene = make_scene("phantom")
     mesh = MeshSource(block=BlockMesh(SIZE, (cells, cells, cells // 2)))
     return replace(scene, mesh=mesh, timing=replace(scene.timing, substep_count=max(4, cells // 3)))
@@ -83,15 +84,16 @@ def held_forces(scene: Scene, depths: tuple[float, ...]) -> list[float]:
         simulation = Simulation(replace(anatomy, scene=pressed))
         simulation.reset(organ, sites[0] + 0.03 * up)
         presses = [press(simulation, site, up) for site in sites]
-        if any(one.end for one in presses):
-            raise ValueError(f"a press ended early: {next(one.end for one in presses if one.end)}")
-        forces.append(float(np.mean([one.force for one in presses])))
+        end = next((touch.end for touch in presses if touch.end), "")
+        if end:
+            raise ValueError(f"a press ended early: {end}")
+        forces.append(float(np.mean([touch.force for touch in presses])))
     return forces
 
 
 @dataclass(frozen=True, eq=False)
 class BallOnOrgan:
-    """A ball with prescribed motion on an organ: the organ, its contact law, the substeps in a haptic step."""
+    """Ball with prescribed motion on an organ: the organ, its contact law, the substeps of a haptic step."""
 
     model: OrganModel
     law: ContactLaw
@@ -99,7 +101,7 @@ class BallOnOrgan:
 
     @classmethod
     def on(cls, model: OrganModel, law: ContactLaw) -> "BallOnOrgan":
-        """The organ with as many substeps as it needs."""
+        """Organ with the substeps that it needs."""
         return cls(model, law, math.ceil(STEP / (0.95 * stable_dt(model, law))))
 
     def move(self, state: OrganState, shapes: ContactShapes, velocity: ArrayLike, count: int) -> FloatArray:
@@ -116,7 +118,7 @@ class BallOnOrgan:
         return force
 
     def held(self, site: ArrayLike, radius: float, depth: float) -> float:
-        """Static force of a ball pressed in at a site of the top [N]."""
+        """Static force of a ball pressed into a site of the top [N]."""
         state = rest_state(self.model, shape_count=1)
         shapes = ball(site, radius)
         self.move(state, shapes, (0.0, 0.0, -PRESS_SPEED), round(depth / (PRESS_SPEED * STEP)))
@@ -127,7 +129,7 @@ class BallOnOrgan:
 
 
 def ball(site: ArrayLike, radius: float) -> ContactShapes:
-    """A ball that just touches the block's top at (x, y) [m]."""
+    """Ball in touch with the block's top at (x, y) [m]."""
     x, y = np.asarray(site, dtype=np.float64)
     centre = np.array([x, y, SIZE[2] + radius])
     return round_shapes([[centre, centre]], radius)
@@ -136,7 +138,7 @@ def ball(site: ArrayLike, radius: float) -> ContactShapes:
 def block(
     cells: int, *, alpha: float | None = ALPHA, lesions: tuple[Lesion, ...] = (), friction: float | None = None
 ) -> BallOnOrgan:
-    """The phantom with `cells` cells along 6 cm; `alpha` [1/s] and `friction` replace those of the scene."""
+    """Phantom with `cells` cells along 6 cm; `alpha` [1/s] and `friction` replace the scene's."""
     scene = phantom(cells)
     model, law = load_anatomy(scene).organ(lesions), scene.contact.law
     return BallOnOrgan.on(
@@ -147,14 +149,14 @@ def block(
 
 @lru_cache(maxsize=16)
 def reference_force(radius: float, depth: float, hidden: Hidden | None = None) -> float:
-    """A rigid ball by axisymmetric elements at finite strain [N], over a sphere if one is given."""
+    """Force of a rigid ball by axisymmetric elements at finite strain [N], over a sphere if given."""
     scene = make_scene("phantom")
     field, mesh = modulus_field(scene.material.youngs_modulus, hidden), layer_mesh(DISC, SIZE[2], FINE, NEAR)
     return PressedLayer(mesh, field, scene.material.poisson_ratio).forces(radius, (depth,))[0]
 
 
 def ball_on_layer(cells: int, depths: tuple[float, ...]) -> Iterator[Result]:
-    """Force of the instrument's ball at the scene's press depth, and how it rises with depth."""
+    """Force of the instrument's ball at the scene's press depth, and its exponent with depth."""
     scene = phantom(cells)
     radius, cell = scene.instrument.tip_radius, SIZE[0] / cells
     reference = [reference_force(radius, depth) for depth in depths]
@@ -175,7 +177,7 @@ def ball_on_layer(cells: int, depths: tuple[float, ...]) -> Iterator[Result]:
     )  # fmt: skip
     millimetres, labels = tuple(1e3 * depth for depth in depths), ("depth [mm]", "force [N]", False)
     yield Curve("ball", f"cell {1e3 * cell:.1f} mm", millimetres, tuple(measured), *labels)
-    # The reference is the same for every cell size and is drawn once.
+    # The reference of all cell sizes is drawn once.
     if cells == 12:
         yield Curve("ball", "reference", millimetres, tuple(reference), *labels)
 
@@ -194,34 +196,34 @@ def sites(
         f"{name}, mean", REFERENCE, expected=reference_force(radius, depth), measured=float(force.mean()),
         tolerance=mean, unit="N", note=note,
     )  # fmt: skip
-    for what, measured, tolerance in (("std", force.std(), deviation), ("max - min", np.ptp(force), spread)):
+    for statistic, measured, tolerance in (("std", force.std(), deviation), ("max - min", np.ptp(force), spread)):
         if tolerance is not None:
             yield compare(
-                f"{name}, {what}", "homogeneous tissue", expected=0.0, measured=float(measured / force.mean()),
+                f"{name}, {statistic}", "homogeneous tissue", expected=0.0, measured=float(measured / force.mean()),
                 tolerance=tolerance, absolute=True, note=f"over the mean; {note}",
             )  # fmt: skip
 
 
 def tissue_loads(cells: int, tolerance: float) -> Iterator[Row]:
-    """Largest contact pressure and principal strain under the scene's tip against those of elements."""
+    """Largest contact pressure and principal strain under the scene's tip against elements."""
     scene = phantom(cells)
     radius, depth = scene.instrument.tip_radius, scene.palpation.press_depth
     field, mesh = modulus_field(scene.material.youngs_modulus, None), layer_mesh(DISC, SIZE[2], 0.5 * FINE, NEAR)
     body = PressedLayer(mesh, field, scene.material.poisson_ratio)
     touch, cell = block(cells, friction=0.0), SIZE[0] / cells
-    found = []
+    loads = []
     for offset in OFFSETS:
         state = rest_state(touch.model, shape_count=1)
         shapes = ball(0.5 * np.array(SIZE[:2]) + cell * np.array(offset), radius)
         touch.move(state, shapes, (0.0, 0.0, -PRESS_SPEED), round(depth / (PRESS_SPEED * STEP)))
         touch.move(state, shapes, (0.0, 0.0, 0.0), HOLD_COUNT)
         load = tissue_load(touch.model, state, shapes, touch.law)
-        found.append((load.pressure, load.strain))
+        loads.append((load.pressure, load.strain))
     expected = body.load(radius, depth, scene.contact.stiffness)
     share = cell / math.sqrt(radius * depth)
-    for what, unit, one, measured in zip(("pressure", "strain"), ("Pa", ""), expected, zip(*found), strict=True):
+    for name, unit, reference, measured in zip(("pressure", "strain"), ("Pa", ""), expected, zip(*loads), strict=True):
         yield compare(
-            f"tissue load, largest {what}, cell / contact radius {share:.2f}", REFERENCE, expected=one,
+            f"tissue load, largest {name}, cell / contact radius {share:.2f}", REFERENCE, expected=reference,
             measured=float(np.mean(measured)), tolerance=tolerance, unit=unit,
             note=f"averages at nodes; {len(OFFSETS)} sites, {min(measured):.3g} to {max(measured):.3g}; tip "
             f"{1e3 * radius:g} mm pressed {1e3 * depth:g} mm, k_p of the scene in both",
@@ -229,7 +231,7 @@ def tissue_loads(cells: int, tolerance: float) -> Iterator[Row]:
 
 
 def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:
-    """Force over a sphere over that without it, at three places on the lattice; without friction, as the reference."""
+    """Force over a sphere over the force without it, at three places on the lattice, without friction."""
     radius, depth = 0.008, 0.004
     cell = SIZE[0] / cells
     anatomy = load_anatomy(phantom(cells))
@@ -249,7 +251,7 @@ def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:
 
 
 def linear_liver() -> Scene:
-    """The scene liver with springs that do not stiffen: the reference is neo-Hookean."""
+    """Scene liver without stiffening: the reference is neo-Hookean."""
     scene = make_scene("liver")
     return replace(scene, material=replace(scene.material, stiffening=None))
 
@@ -257,8 +259,8 @@ def linear_liver() -> Scene:
 def liver_contrast() -> Iterator[Row]:
     """Contrast of a slab with the scene liver's tissue without stiffening, its capsule, cells and contact.
 
-    Against a rigid tip: sphere of 20 mm under 5 mm, 6 times as stiff, tip 12 mm, pressed 3, 5 and 7 mm; then what the
-    contact of the scene hides of it by the same elements.
+    Against a rigid tip: sphere of 20 mm under 5 mm, 6 times as stiff, tip 12 mm, pressed 3, 5 and 7 mm; then the share
+    hidden by the scene's contact, by the same elements.
     """
     scene = linear_liver()
     assert scene.mesh.surface is not None and scene.capsule is not None
@@ -275,29 +277,25 @@ def liver_contrast() -> Iterator[Row]:
             f"capsule, k_p {scene.contact.stiffness:g} N/m^3, mean of {len(OFFSETS)} sites",
         )  # fmt: skip
     soft = liver_reference(LIVER_SPHERE, scene.contact.stiffness)
-    hides = 1.0 - (soft / liver_reference(None, scene.contact.stiffness) - 1.0) / rigid
+    hidden = 1.0 - (soft / liver_reference(None, scene.contact.stiffness) - 1.0) / rigid
     for number, depth in enumerate(LIVER_DEPTHS):
-        said = hidden_share(float(soft[number]), tip, depth, scene.contact.stiffness)
+        formula = hidden_share(float(soft[number]), tip, depth, scene.contact.stiffness)
         yield bounded(
             f"hidden by contact, the same sphere, pressed {1e3 * depth:g} mm", "scikit-fem, k_p of the scene or rigid",
-            measured=float(hides[number]), most=0.05,
-            note=f"share of the contrast over 1; the formula of the reports says {said:.3f}",
+            measured=float(hidden[number]), most=0.05,
+            note=f"share of the contrast over 1; the formula of the reports says {formula:.3f}",
         )  # fmt: skip
 
 
 @lru_cache(maxsize=8)
-def _liver_reference(hidden: Hidden | None, contact_stiffness: float) -> tuple[float, ...]:
+def liver_reference(hidden: Hidden | None, contact_stiffness: float) -> FloatArray:
+    """Forces of the liver's tip at LIVER_DEPTHS on a layer of 8 cm of its tissue with its capsule [N]."""
     scene = linear_liver()
     assert scene.capsule is not None and scene.capsule.thickness is not None
     membrane = scene.capsule.youngs_modulus * scene.capsule.thickness
     field, mesh = modulus_field(scene.material.youngs_modulus, hidden), layer_mesh(0.08, 0.08, 1e-3, (0.016, 0.012))
     body = PressedLayer(mesh, field, scene.material.poisson_ratio, membrane=membrane)
-    return tuple(body.forces(scene.instrument.tip_radius, LIVER_DEPTHS, contact_stiffness))
-
-
-def liver_reference(hidden: Hidden | None, contact_stiffness: float) -> FloatArray:
-    """Forces of the liver's tip at LIVER_DEPTHS on a layer of 8 cm of its tissue with its capsule [N]."""
-    return np.array(_liver_reference(hidden, contact_stiffness))
+    return np.array(body.forces(scene.instrument.tip_radius, LIVER_DEPTHS, contact_stiffness))
 
 
 def _slab_forces(scene: Scene, cell: float, hidden: Hidden | None) -> FloatArray:
@@ -305,31 +303,29 @@ def _slab_forces(scene: Scene, cell: float, hidden: Hidden | None) -> FloatArray
     across, down = SLAB_COUNT
     mesh = box_mesh((across * cell, across * cell, down * cell), (across, across, down))
     radius, top = scene.instrument.tip_radius, down * cell
-    anchors = np.flatnonzero(mesh.points[:, 2] < 1e-9)
-    found = np.zeros(len(LIVER_DEPTHS))
+    floor = nodes_at(mesh.points, 0.0)
+    forces = np.zeros(len(LIVER_DEPTHS))
     for offset in OFFSETS:
         place = 0.5 * across * cell + cell * np.array(offset)
         lesions: tuple[Lesion, ...] = ()
         if hidden is not None:
             hard = replace(scene.material, youngs_modulus=hidden.ratio * scene.material.youngs_modulus)
             lesions = (Lesion((*place, top - hidden.cover - hidden.radius), hidden.radius, hard),)
-        model = compile_organ(
-            OrganSpec(
-                mesh, scene.material, scene.capsule, lesions=lesions, anchors=anchors, damping=Damping(SLAB_ALPHA)
-            )
-        )
+        damping = Damping(SLAB_ALPHA)
+        spec = OrganSpec(mesh, scene.material, scene.capsule, lesions=lesions, anchors=floor, damping=damping)
+        model = compile_organ(spec)
         touch = BallOnOrgan.on(model, scene.contact.law._replace(friction=0.0))
         state, start = rest_state(model, shape_count=1), np.array([*place, top + radius])
         shapes, reached = round_shapes([[start, start]], radius), 0.0
         for number, depth in enumerate(LIVER_DEPTHS):
             touch.move(state, shapes, (0.0, 0.0, -PRESS_SPEED), round((depth - reached) / (PRESS_SPEED * STEP)))
-            found[number] += touch.move(state, shapes, (0.0, 0.0, 0.0), SLAB_HOLD)[-1, 2] / len(OFFSETS)
+            forces[number] += touch.move(state, shapes, (0.0, 0.0, 0.0), SLAB_HOLD)[-1, 2] / len(OFFSETS)
             reached = depth
-    return found
+    return forces
 
 
 def deep_presses(target: float = 1.2) -> Iterator[Row]:
-    """Balls of 3, 5 and 8 mm on 5 mm cells, slow and at 1 m/s, to 1.5 times the hard limit or to a named fault."""
+    """Contact of balls of 3, 5 and 8 mm on 5 mm cells, slow and at 1 m/s, to 1.5 times the hard limit or a fault."""
     touch = block(12, alpha=None)
     lost, faults, falls = [], [], []
     for radius, speed, (place, site) in product((0.003, 0.005, 0.008), (0.02, 1.0), PLACES.items()):
@@ -338,22 +334,22 @@ def deep_presses(target: float = 1.2) -> Iterator[Row]:
         touched = force[np.argmax(force > 0.0) :]
         if fault:
             faults.append(name)
-        # Contact is lost if it lets go without a fault, or if the force fell by a fifth before the fault.
+        # Contact is lost without force or fault, or if the force fell by a fifth before the fault.
         if force[-1] < 0.8 * force.max() or not (fault or force[-1] >= target):
             lost.append(name)
         if speed < 0.1 and (np.diff(touched[9::10]) <= 0.0).any():
             falls.append(name)
-    for what, which in (("lost without a fault", lost), ("whose force falls with depth", falls)):
+    for event, names in (("lost without a fault", lost), ("whose force falls with depth", falls)):
         yield compare(
-            f"touch, presses to {target:g} N {what}", "contact holds", expected=0.0, measured=float(len(which)),
+            f"touch, presses to {target:g} N {event}", "contact holds", expected=0.0, measured=float(len(names)),
             tolerance=0.0, absolute=True,
-            note=f"of {6 * len(PLACES)}; {', '.join(which) or 'none'}; a tet turned inside out, said so, "
+            note=f"of {6 * len(PLACES)}; {', '.join(names) or 'none'}; a tet turned inside out, said so, "
             f"in {len(faults)}",
         )  # fmt: skip
 
 
 def _deep(touch: BallOnOrgan, site: ArrayLike, radius: float, speed: float, target: float) -> tuple[FloatArray, bool]:
-    """Force of each haptic step until the target, 25 mm or a fault, and whether it was a fault."""
+    """Force of each haptic step until the target, 25 mm or a fault; true for a fault."""
     state, shapes = rest_state(touch.model, shape_count=1), ball(site, radius)
     force: list[float] = []
     while not force or (force[-1] < target and len(force) * speed * STEP < 0.025):

@@ -1,7 +1,8 @@
 """The force exchange between organ and instrument: haptic steps in one call, compiled or in Python."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from surgsim_env.coupling.haptic_kernels import (
     advance_haptic_steps,
 )
 from surgsim_env.coupling.motion import still
-from surgsim_env.coupling.motion_kernels import MotionDrive
 from surgsim_env.instruments.tool_bodies import ToolBodies
 
 
@@ -51,16 +51,12 @@ def haptic_steps(
     wrench: FloatArray,
     count: int = 1,
     *,
-    drive: MotionDrive | None = None,
-    force_limit: float = math.inf,
-    pull_limit: float = math.inf,
     compiled: bool = False,
 ) -> StepsTaken:
     """Advance organ and instrument together by up to `count` haptic steps of `substep_count` substeps of dt [s].
 
-    `wrench` (n_tool, 6) [N, N m] receives the mean wrench of the tissue in the last good step. The step whose total
-    force is beyond `force_limit` [N], or a jaw's pull beyond `pull_limit` [N], is the last. Compiled, all is one call
-    without the interpreter's lock, equal to the bit.
+    `wrench` (n_tool, 6) [N, N m] receives the mean wrench of the tissue in the last good step. Compiled, all is one
+    call without the interpreter's lock, equal to the bit.
 
     The instrument's shapes are read from the current step (mj_step1) and move along their twist through the organ's
     substeps. The MEAN wrench of the tissue, with its torque about each tool's centre of mass at the start of the step,
@@ -78,16 +74,46 @@ def haptic_steps(
     Raises:
         RuntimeError: compiled, where MuJoCo's functions are not known to the linker (says why).
     """
-    if compiled and (missing := mujoco_library.missing()):
-        raise RuntimeError(f"haptic steps cannot be compiled: {missing}; call haptic_steps with compiled=False")
-    plan = StepPlan(dt, float(exp(-model.alpha * dt)), substep_count, count, force_limit, pull_limit)
+    advance, tools = haptic_loop(compiled=compiled), instrument.views(compiled=compiled)
+    plan = step_plan(model.alpha, dt, substep_count, count)
     outcome = step_outcome(1, instrument.tool_count)._replace(wrench=wrench[None])
-    advance = advance_haptic_steps if compiled else advance_haptic_steps.py_func
-    tools = instrument.views(compiled=compiled)
-    if drive is None:
-        drive = still(dt * substep_count)
+    drive = still(dt * substep_count)
     advance(model, state, contact, instrument.shapes, instrument.response, tools, drive, plan, outcome)
     return steps_taken(model, state, outcome, 0)
+
+
+def haptic_loop(*, compiled: bool) -> Callable[..., Any]:
+    """`advance_haptic_steps`, compiled or in Python.
+
+    Raises:
+        RuntimeError: compiled, where MuJoCo's functions are not known to the linker (says why).
+    """
+    if not compiled:
+        return advance_haptic_steps.py_func
+    if missing := mujoco_library.missing():
+        raise RuntimeError(f"haptic steps cannot be compiled: {missing}; run them with compiled=False")
+    return advance_haptic_steps
+
+
+def step_plan(
+    alpha: float,
+    dt: float,
+    substep_count: int,
+    count: int,
+    force_limit: float = math.inf,
+    pull_limit: float = math.inf,
+) -> StepPlan:
+    """The plan of `count` haptic steps of `substep_count` substeps of dt [s].
+
+    Args:
+        alpha: mass-proportional damping rate of the organ [1/s].
+        dt: [s].
+        substep_count: in each haptic step.
+        count: number of haptic steps.
+        force_limit: the step whose total force of the tissue exceeds it is the last [N].
+        pull_limit: the same for the pull of a jaw [N].
+    """
+    return StepPlan(dt, float(exp(-alpha * dt)), substep_count, count, force_limit, pull_limit)
 
 
 def step_outcome(lanes: int, tool_count: int) -> StepOutcome:

@@ -13,8 +13,9 @@ from numba import njit
 from numba.extending import overload, register_jitable
 from numpy.typing import NDArray
 
+from msdm_core.kernels.lane_view_kernels import response_of, shapes_of
 from msdm_core.kernels.option_kernels import JITABLE, KERNEL
-from msdm_core.kernels.structure_kernels import FAULT_NONE, LANE_EMPTY, response_of, shapes_of
+from msdm_core.kernels.structure_kernels import FAULT_NONE, LANE_EMPTY
 from msdm_core.kernels.substep_kernels import advance_inside, advance_substeps
 from surgsim_env.coupling.motion_kernels import steer_motion
 from surgsim_env.instruments.mujoco_kernels import mj_step1, mj_step2

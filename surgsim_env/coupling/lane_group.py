@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from msdm_core.arithmetic import exp
 from msdm_core.kernels.structure_kernels import LANE_EMPTY, OrganModel
 from msdm_core.lanes.lanes import (
     get_lane,
@@ -21,8 +19,8 @@ from msdm_core.lanes.lanes import (
     stack_organs,
     stack_shapes,
 )
-from surgsim_env.coupling.exchange import step_outcome, steps_taken
-from surgsim_env.coupling.haptic_kernels import StepPlan, advance_lane_haptic_steps
+from surgsim_env.coupling.exchange import step_outcome, step_plan, steps_taken
+from surgsim_env.coupling.haptic_kernels import advance_lane_haptic_steps
 from surgsim_env.coupling.simulation import Simulation
 
 
@@ -54,11 +52,14 @@ class LaneGroup:
         self._outcome = step_outcome(count, tools)
 
     def control_step(
-        self, active: NDArray[np.bool_], count: int, force_limit: float, pull_limit: float = math.inf
+        self, moving: Sequence[Simulation], count: int, force_limit: float, pull_limit: float = math.inf
     ) -> None:
-        """Advance the active simulations (n,) by up to `count` haptic steps; each of them takes over its result.
+        """Advance some of the simulations by up to `count` haptic steps, as `Simulation.control_step` does alone.
 
         Several threads may do so for several groups, because the compiled call releases the interpreter's lock.
+
+        Raises:
+            RuntimeError: one of them is being recorded.
         """
         if not self._own_rest and not all(
             one.organ_model is known or same_rest(one.organ_model, self._organs[0])
@@ -66,15 +67,17 @@ class LaneGroup:
         ):
             self._stack()
         for lane, simulation in enumerate(self.simulations):
-            self._load(lane, simulation, bool(active[lane]))
+            if simulation in moving:
+                self._load(lane, simulation)
+            else:
+                self._state.lane_fault[lane] = LANE_EMPTY
         first = self.simulations[0]
         views = [one.instrument.views(compiled=True) for one in self.simulations]
         # Always as many as there are lanes: numba would compile another number anew.
         views += [views[-1]] * (len(self._outcome.step_count) - len(views))
         drives = [one.drive for one in self.simulations]
         drives += [drives[-1]] * (len(self._outcome.step_count) - len(drives))
-        decay = float(exp(-self._model.alpha * first.substep_dt))
-        plan = StepPlan(first.substep_dt, decay, first.substep_count, count, force_limit, pull_limit)
+        plan = step_plan(self._model.alpha, first.substep_dt, first.substep_count, count, force_limit, pull_limit)
         outcome = self._outcome._replace(stopped=self._state.lane_fault)
         advance_lane_haptic_steps(
             self._model,
@@ -87,8 +90,9 @@ class LaneGroup:
             plan,
             outcome,
         )
-        for lane in np.flatnonzero(active):
-            self._unload(int(lane))
+        for lane, simulation in enumerate(self.simulations):
+            if simulation in moving:
+                self._unload(lane, simulation)
 
     def _stack(self) -> None:
         """Make lanes for the present organs of the simulations."""
@@ -98,21 +102,18 @@ class LaneGroup:
         self._model = stack_organs(self._organs, **settings)
         self._state = lanes_of([one.organ_state for one in self.simulations], self._organs[0], **settings)
 
-    def _load(self, lane: int, simulation: Simulation, active: bool) -> None:
-        if not active:
-            self._state.lane_fault[lane] = LANE_EMPTY
-            return
+    def _load(self, lane: int, simulation: Simulation) -> None:
+        simulation.begin_in_lanes()
         if simulation.organ_model is not self._organs[lane]:
             set_lane(self._model, lane, simulation.organ_model)
             self._organs[lane] = simulation.organ_model
         put_lane(self._state, lane, simulation.organ_state)
-        simulation.begin_motion()
         self._outcome.wrench[lane] = simulation.contact_wrench
 
-    def _unload(self, lane: int) -> None:
-        simulation, organ_state = self.simulations[lane], get_lane(self._state, lane)
+    def _unload(self, lane: int, simulation: Simulation) -> None:
+        organ_state = get_lane(self._state, lane)
         taken = steps_taken(simulation.organ_model, organ_state, self._outcome, lane)
         # Tasks read the shapes: torques are about their tools' centres.
         for own, moved in zip(simulation.instrument.shapes, lane_shapes(self._shapes, lane), strict=True):
             own[...] = moved
-        simulation.take_over(organ_state, self._outcome.wrench[lane], taken)
+        simulation.end_in_lanes(organ_state, self._outcome.wrench[lane], taken)

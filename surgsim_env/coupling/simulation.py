@@ -12,14 +12,15 @@ from numpy.typing import ArrayLike
 from msdm_core.arithmetic import matmul
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
-from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, SCRATCH_FIELDS, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, KEPT_NAMES, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.compile import blank_state, relax_arms, rest_state
+from msdm_core.organ.compile import relax_arms, rest_state
 from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
 from msdm_core.organ.motion import SIGNAL, place_on_ground
 from msdm_core.organ.stability import stable_dt
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import describe_fault
-from surgsim_env.coupling.exchange import StepsTaken, haptic_steps
+from surgsim_env.coupling.exchange import StepsTaken, haptic_loop, step_outcome, step_plan, steps_taken
 from surgsim_env.coupling.motion import draw_drive, go_on, hold, signals
 from surgsim_env.coupling.mujoco_library import runs_compiled
 from surgsim_env.instruments.instrument import Grasp, Instrument, read_grasp
@@ -29,7 +30,6 @@ from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import substeps_needed
 
 # The fields of an organ's state that are saved.
-KEPT_FIELDS = tuple(name for name in OrganState._fields if name not in SCRATCH_FIELDS)
 # What is drawn of an organ's motions, and saved.
 DRAWN_FIELDS = ("cycle_start", "cycle_size", "delay")
 # The tip may move this far beyond the organ's bounding box [m].
@@ -104,7 +104,8 @@ class Simulation:
     Fields:
         drive: the course of the organ's motions since the reset
         compiled: whether haptic steps run compiled or in Python, with the same bits
-        pull_peak: largest pull of a jaw in the last control step [N]
+        force_peak: largest total force of the tissue in the last control step [N]
+        pull_peak: largest pull of a jaw in it, the size of the sum of its fingers' forces [N]
         fault: what ended the last steps, or ""
     """
 
@@ -131,8 +132,7 @@ class Simulation:
         self._step = self._motion_start = 0
         self.fault = ""
         self.compiled = runs_compiled()
-        self.pull_peak = 0.0
-        self._taken: StepsTaken | None = None
+        self.force_peak = self.pull_peak = 0.0
         self._record: HapticRecord | None = None
         # The motions that stop in apnoea.
         self._breath = [number for number, one in enumerate(scene.motions) if one.stops_in_apnoea]
@@ -145,11 +145,6 @@ class Simulation:
     def time(self) -> float:
         """Simulated time since the reset [s]."""
         return self._step * self.haptic_dt
-
-    @property
-    def taken_over(self) -> bool:
-        """Whether a group of lanes has already computed the next `control_step`."""
-        return self._taken is not None
 
     @property
     def contact_wrench(self) -> FloatArray:
@@ -234,12 +229,12 @@ class Simulation:
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
         self.fault = ""
-        self.pull_peak = 0.0
-        self._taken = None
+        self.force_peak = self.pull_peak = 0.0
 
     def haptic_step(self) -> bool:
         """Advance by one haptic step; False, with `fault` saying why, on divergence of the organ."""
-        return not self._advance(1, math.inf, math.inf).fault
+        self.control_step(1)
+        return not self.fault
 
     def control_step(self, count: int, force_limit: float = math.inf, pull_limit: float = math.inf) -> float:
         """Advance by `count` haptic steps, fewer after a `fault` or beyond a limit.
@@ -252,19 +247,31 @@ class Simulation:
         Returns:
             The largest total force of the tissue in these steps [N]; `pull_peak` is the largest pull.
         """
-        if self._taken is not None:
-            taken, self._taken = self._taken, None
-            self.pull_peak = taken.pull_peak
-            return taken.force_peak
-        force_peak = self.pull_peak = 0.0
+        self.force_peak = self.pull_peak = 0.0
+        advance, instrument = haptic_loop(compiled=self.compiled), self.instrument
         # A recording reads the instrument after each step.
         for size in [count] if self._record is None else [1] * count:
-            taken = self._advance(size, force_limit, pull_limit)
-            force_peak = max(force_peak, taken.force_peak)
-            self.pull_peak = max(self.pull_peak, taken.pull_peak)
+            self.begin_motion()
+            # After a fault the wrench of the last good step stays.
+            outcome = step_outcome(1, instrument.tool_count)._replace(wrench=self._wrench[None])
+            advance(
+                self.organ_model,
+                self.organ_state,
+                self.contact,
+                instrument.shapes,
+                instrument.response,
+                instrument.views(compiled=self.compiled),
+                self.drive,
+                step_plan(self.organ_model.alpha, self.substep_dt, self.substep_count, size, force_limit, pull_limit),
+                outcome,
+            )
+            taken = steps_taken(self.organ_model, self.organ_state, outcome, 0)
+            self._count(taken)
+            if self._record is not None and taken.step_count:
+                self._record.note(self.time, self._wrench)
             if taken.ended:
                 break
-        return force_peak
+        return self.force_peak
 
     @contextmanager
     def recording(self) -> Iterator[HapticRecord]:
@@ -275,24 +282,35 @@ class Simulation:
         finally:
             self._record = None
 
-    def take_over(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
-        """Accept a control step that a group of lanes has computed; the next `control_step` only returns its result.
-
-        Args:
-            organ_state: the organ's state after it; the instrument's own data has been advanced too.
-            wrench: of the last good haptic step [N, N m], shape (n_tool, 6).
-            taken: the result.
+    def begin_in_lanes(self) -> None:
+        """Begin a control step that a group of lanes computes.
 
         Raises:
             RuntimeError: the simulation is being recorded, and these steps would be missing.
         """
         if self._record is not None:
             raise RuntimeError("a simulation that advances among others is not recorded: step its environment alone")
+        self.force_peak = self.pull_peak = 0.0
+        self.begin_motion()
+
+    def end_in_lanes(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
+        """End a control step that a group of lanes has computed; the instrument's own data have been advanced too.
+
+        Args:
+            organ_state: the organ's state after it.
+            wrench: of the last good haptic step [N, N m], shape (n_tool, 6).
+            taken: the result.
+        """
         self.organ_state = organ_state
         self._wrench[:] = wrench
+        self._count(taken)
+
+    def _count(self, taken: StepsTaken) -> None:
+        """Advance the clock by haptic steps, and note their fault and their largest forces."""
         self._step += taken.step_count
         self.fault = taken.fault or self.fault
-        self._taken = taken
+        self.force_peak = max(self.force_peak, taken.force_peak)
+        self.pull_peak = max(self.pull_peak, taken.pull_peak)
 
     def draw_motion(self, rng: np.random.Generator) -> None:
         """Draw the course of the organ's motions from now on; without motions nothing is drawn."""
@@ -424,35 +442,11 @@ class Simulation:
         self.pull_peak = float(arrays["pull_peak"])
         self._step = int(arrays["step"])
         self.fault = str(arrays["fault"])
-        self._taken = None
 
     @property
     def _kept_fields(self) -> tuple[str, ...]:
-        """KEPT_FIELDS, without those of motions where nothing moves the organ."""
-        return KEPT_FIELDS if self.anatomy.scene.motions else tuple(name for name in KEPT_FIELDS if name != "motion")
-
-    def _advance(self, count: int, force_limit: float, pull_limit: float) -> StepsTaken:
-        """Advance by up to `count` haptic steps; after a fault the wrench of the last good step stays."""
-        self.begin_motion()
-        taken = haptic_steps(
-            self.organ_model,
-            self.organ_state,
-            self.instrument,
-            self.contact,
-            self.substep_dt,
-            self.substep_count,
-            self._wrench,
-            count,
-            force_limit=force_limit,
-            pull_limit=pull_limit,
-            compiled=self.compiled,
-            drive=self.drive,
-        )
-        self._step += taken.step_count
-        self.fault = taken.fault or self.fault
-        if self._record is not None and taken.step_count:
-            self._record.note(self.time, self._wrench)
-        return taken
+        """KEPT_NAMES, without those of motions where nothing moves the organ."""
+        return KEPT_NAMES if self.anatomy.scene.motions else tuple(name for name in KEPT_NAMES if name != "motion")
 
     def _check_step(self, organ_model: OrganModel) -> None:
         limit = stable_dt(organ_model, self.contact)

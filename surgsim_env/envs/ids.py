@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from surgsim_env.envs.palpate_sites_env import PalpateSitesEnv
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.palpate import PalpateTask
@@ -37,9 +38,7 @@ class BimanualRetractEnv(SurgicalEnv):
     task: BimanualRetractTask
 
 
-def register_task(
-    id: str, task_class: type[Task], *, entry_point: str | None = None, vector_entry_point: str | None = None
-) -> None:
+def register_task(id: str, task_class: type[Task], *, lanes: bool = True) -> None:
     """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
 
     The environment takes the arguments of `SurgicalEnv` and the task's own. Registering an id again replaces it, so
@@ -48,16 +47,15 @@ def register_task(
     Args:
         id: "Namespace/Name-v0".
         task_class: declares channels and rewards (`surgsim_env.Task`).
-        entry_point: "module:class" of the environment, for a task that needs a class of its own.
-        vector_entry_point: likewise of the vector environment.
+        lanes: whether its instrument can act in many environments side by side: one arm can, a pair cannot.
     """
     TASKS[id] = task_class
     gym.registry.pop(id, None)
     gym.register(
         id=id,
-        entry_point=entry_point or f"surgsim_env.envs.ids:{id}",
-        vector_entry_point=(vector_entry_point or f"surgsim_env.envs.vector_env:{id}") if task_class.lanes else None,
-        max_episode_steps=task_class.episode_steps,
+        entry_point=f"surgsim_env.envs.ids:{id}",
+        vector_entry_point=f"surgsim_env.envs.vector_env:{id}" if lanes else None,
+        max_episode_steps=task_class.setup.episode_steps,
     )
 
 
@@ -72,7 +70,7 @@ def __getattr__(name: str) -> Any:
 @cache
 def environment_class(task_class: type[Task]) -> type[SurgicalEnv]:
     """The environment class of a task: a shipped one, or one that is made for it."""
-    for shipped in (PalpateEnv, RetractEnv, BimanualRetractEnv):
+    for shipped in (PalpateEnv, RetractEnv, BimanualRetractEnv, PalpateSitesEnv):
         if shipped.task_class is task_class:
             return shipped
     name = task_class.__name__.removesuffix("Task") + "Env"
@@ -83,10 +81,5 @@ def register() -> None:
     """Register the shipped ids with Gymnasium; importing `surgsim_env` does it."""
     register_task("SurgSim/Palpate-v0", PalpateTask)
     register_task("SurgSim/Retract-v0", RetractTask)
-    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask)
-    register_task(
-        "SurgSim/PalpateSites-v0",
-        PalpateSitesTask,
-        entry_point="surgsim_env.envs.palpate_sites_env:PalpateSitesEnv",
-        vector_entry_point="surgsim_env.envs.palpate_sites_env:PalpateSitesVectorEnv",
-    )
+    register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask, lanes=False)
+    register_task("SurgSim/PalpateSites-v0", PalpateSitesTask)

@@ -1,8 +1,8 @@
 """The Gymnasium environment: it puts a simulation and a task together and computes no physics and no reward itself."""
 
-import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.simulation import check_entries
+from surgsim_env.coupling.lane_group import LaneGroup
+from surgsim_env.envs.saved_state import pack_state, restore_state, state_maker
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
-from surgsim_env.scene.digest import scene_digest
 from surgsim_env.scene.load import fill
-from surgsim_env.tasks.declaration import documentation
+from surgsim_env.tasks.declaration import ControlStep, documentation, reward_weights
+from surgsim_env.tasks.runtime import make_runtime, setting_names
 from surgsim_env.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -29,13 +30,9 @@ Info = dict[str, Any]
 
 # How far an action may leave [-1, 1] by rounding.
 ACTION_SLACK = 1e-6
-# Draws of an episode until the task has to accept one.
-DRAWS_MOST = 20
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
-# Version of the format of saved states.
-STATE_VERSION = 1
 
 
 class SurgicalEnv(gym.Env[Observation, Action]):
@@ -82,22 +79,18 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if obs_mode not in OBSERVATION_MODES:
             raise ValueError(f"obs_mode {obs_mode!r} is unknown; the modes are {', '.join(OBSERVATION_MODES)}")
         kind = self.task_class
-        own = {name: settings.pop(name) for name in kind.setting_names() & set(settings)}
-        simulation, task = kind.make(
-            kind.default_scene if scene is None else scene,
-            kind.default_instrument if instrument is None else instrument,
-            **own,
-        )
+        own = {name: settings.pop(name) for name in setting_names(kind) & set(settings)}
+        simulation, self.runtime = make_runtime(kind, scene, instrument, **own)
         self.scene, self._mesh = simulation.anatomy.scene, simulation.anatomy.mesh
         self.simulation = simulation
         self._view = EpisodeView(self.simulation, render_mode, settings)
         self.render_mode = render_mode
         # The modes that this machine offers; the class names all that there are.
         self.metadata = self._view.metadata()  # type: ignore[misc]
-        self.task = task
-        self._low, self._high = (side.astype(np.float32) for side in task.bounds(self.simulation.instrument))
+        self.task, self.layout = self.runtime.task, self.runtime.layout
+        self._low, self._high = (side.astype(np.float32) for side in self.layout.bounds(simulation.instrument))
         # An observation is (task observation - origin) / scale.
-        origin, scale = task.scales(self.simulation.instrument)
+        origin, scale = self.layout.scales(simulation.instrument)
         self.scaled = scaled
         self._origin, self._scale = (origin, scale) if scaled else (np.zeros_like(origin), np.ones_like(scale))
         self._eye: EpisodeView | None = None
@@ -110,19 +103,19 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
         low, high = self.as_observed(self._low), self.as_observed(self._high)
         if obs_mode == "rgb_force":
-            self._felt = task.force_entries
+            self._felt = self.layout.force_entries
             if not self._felt:
                 raise ValueError(
-                    f'obs_mode is "rgb_force", and {type(task).__name__} has no channel that depends on force sensing: '
+                    f'obs_mode is "rgb_force", and {kind.__name__} has no channel that depends on force sensing: '
                     'mark one as felt, or observe "rgb"'
                 )
             force = gym.spaces.Box(low[self._felt], high[self._felt], dtype=np.float32)
             self.observation_space = gym.spaces.Dict({"picture": self.observation_space, "force": force})
         elif obs_mode == "state":
             self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (task.action_size,), dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.layout.action_size,), dtype=np.float32)
         self._observation = np.zeros(self._low.shape, dtype=np.float32)
-        self._unobserved = [] if observe_force else task.force_entries
+        self._unobserved = [] if observe_force else self.layout.force_entries
         # The eye's picture of the last observation; None until it is drawn.
         self._picture: NDArray[np.uint8] | None = None
         self._look_ranges: LookRanges | None = None
@@ -131,7 +124,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         if looks is not None:
             self.take_looks(looks)
         # The action of the last step, after wrappers changed it.
-        self.last_action = np.zeros(task.action_size)
+        self.last_action = np.zeros(self.layout.action_size)
         self._begun = False
         self._running = False
 
@@ -163,7 +156,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
         self._draw_look(seed)
         self._draw()
-        values, saturated = self.task.observe(self.simulation, self.np_random)
+        values, saturated = self.runtime.observe(ControlStep(self.simulation), self.np_random)
         if wrong := self._out_of_bounds(values):
             raise ValueError(
                 f"{type(self.task).__name__}, after a reset: {wrong}; a channel's read must stay within its low and "
@@ -171,45 +164,83 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             )
         self._take(values)
         self._begun = self._running = True
-        own = self.task.info(None, "") | self.task.tissue_info(None, "")
-        info = self._info("", saturated, own, dict.fromkeys(self.task.weights, 0.0))
+        info = self._info("", saturated, self.runtime.first_info(), dict.fromkeys(reward_weights(self.task), 0.0))
         self._show()
         return self._observed(), info
 
-    def command(self, action: Action) -> None:
-        """Check an action and give the commands that it holds; the first part of `step`, which repeats it.
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+        """One control step: haptic steps until it is over, a force limit is passed or the simulation faults.
 
         Raises:
             ResetNeeded: no episode is running.
             ValueError: names the entry of the action that is out of bounds.
         """
-        if not self._running:
-            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
-        values = self._checked(action)
-        if not self.simulation.taken_over:
-            self.task.command(values, self.simulation.instrument)
+        self.begin(self.checked(action))
+        self.advance([self])
+        return self.finish()
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
-        """One control step: haptic steps until it is over, a force limit is passed or the simulation faults."""
-        self.command(action)
-        self.last_action = self._checked(action)
-        self.task.begin(self.last_action)
-        force_peak = self._advance()
+    def checked(self, action: Action | FloatArray, lane: int | None = None) -> FloatArray:
+        """An action (n_action,) for `begin`; the lane of a vector environment is named in refusals.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: names the entry of the action that is out of bounds.
+        """
+        place, wrapper = ("", "ClipAction") if lane is None else (f"lane {lane}: ", "vector.ClipAction")
+        if not self._running:
+            raise gym.error.ResetNeeded(f"{place}the episode is over or has not begun: call reset()")
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"{place}action has shape {values.shape}; the rule is {self.action_space.shape}")
+        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
+        if bad.size:
+            raise ValueError(
+                f"{place}action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
+                f"wrap the environment in gymnasium.wrappers.{wrapper}"
+            )
+        return values
+
+    def begin(self, action: FloatArray) -> None:
+        """Command a `checked` action (n_action,): the first part of `step`."""
+        self.last_action = action
+        self.runtime.begin(action, self.simulation.instrument)
+
+    def advance(self, group: Sequence[Any], lanes: LaneGroup | None = None) -> None:
+        """Advance the simulations of a group by what a step lasts: the second part of `step`, once for the group.
+
+        Args:
+            group: environments that have begun the step, this one among them.
+            lanes: has their simulations; None for this one alone.
+        """
+        count = self.scene.timing.haptic_steps_per_control
+        limits = (self.runtime.force_limit, self.runtime.pull_limit)
+        if lanes is None:
+            self.simulation.control_step(count, *limits)
+        else:
+            lanes.control_step([env.simulation for env in group], count, *limits)
+
+    def finish(self) -> tuple[Observation, float, bool, bool, Info]:
+        """Observe and judge the step: its last part, whose result is that of `step`."""
         fault = self.simulation.fault
         saturated = False
         if not fault:
             self.simulation.end_control_step()
-            values, saturated = self.task.observe(self.simulation, self.np_random)
+            values, saturated = self.runtime.observe(ControlStep(self.simulation, self.force_peak), self.np_random)
             fault = self.simulation.fault or self._out_of_bounds(values)
             if not fault:
                 self._take(values)
-        verdict = self.task.judge(self.simulation, force_peak, fault)
+        verdict = self.runtime.judge(ControlStep(self.simulation, self.force_peak, fault))
         self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
         self._show()
         # Not `sum`, which rounds once from Python 3.12 on and at each term before.
         reward = math.fsum(verdict.rewards.values())
         return self._observed(), reward, verdict.terminated, verdict.truncated, info
+
+    @property
+    def force_peak(self) -> float:
+        """Largest contact force of the last step [N]."""
+        return self.simulation.force_peak
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The picture of this moment in mode "rgb_array", shape (height, width, 3); a window shows each step by itself.
@@ -241,7 +272,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     @property
     def observation_slices(self) -> dict[str, slice]:
         """The entries of an observation that each channel has: `observation[observation_slices["contact_force"]]`."""
-        return dict(self.task.observation_slices)
+        return dict(self.layout.observation_slices)
 
     @property
     def observation(self) -> Observation:
@@ -282,20 +313,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         """
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
-        arrays = self.simulation.get_state()
-        arrays["made_by"] = np.array(self._maker())
-        arrays["task"] = np.array(self.task.get_state())
-        arrays["random"] = np.array(json.dumps(self.np_random.bit_generator.state))
-        arrays["observation"] = self._observation.copy()
-        arrays["running"] = np.array(self._running)
-        if self._look is not None:
-            arrays["look"] = np.array(json.dumps(asdict(self._look)))
-            arrays["look_random"] = np.array(json.dumps(self._look_random.bit_generator.state))
-        if self.task.family is not None:
-            arrays["member"] = np.array(str(self.task.anatomy.member))
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        return buffer.getvalue()
+        return pack_state(self._maker(), self.simulation, self.runtime, self._own_state())
 
     def load_state(self, state: bytes) -> None:
         """Restore a state from `save_state`, to the bit, in this or another environment of the same scene.
@@ -306,25 +324,29 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             ValueError: bytes that are no saved state, or one of another scene, mesh or version (names both); names the
                 entry that is missing, unknown or of another shape.
         """
-        arrays = _unpacked(state, made_by=self._maker())
-        names = ["made_by", "task", "random", "running", "observation"]
-        names += ["member"] if self.task.family is not None else []
-        names += ["look", "look_random"] if self._look_ranges is not None else []
-        own = {name: arrays.pop(name) for name in names if name in arrays}
-        check_entries(own, {**dict.fromkeys(names, np.array("")), "observation": self._observation})
-        text, anatomy = str(own["task"]), self.task.anatomy
-        if self.task.family is not None:
-            anatomy = self.task.family.named(str(own["member"]))
-        # The first change, which leaves all as it is if it is refused.
-        self.simulation.set_state(self.task.saved_organ(text, anatomy), arrays)
-        self.task.set_state(text, anatomy)
-        self.simulation.take_anatomy(anatomy)
+        own = restore_state(state, self._maker(), self.simulation, self.runtime, self._own_state())
         self.np_random.bit_generator.state = json.loads(str(own["random"]))
         if self._look_ranges is not None:
             self._look = fill(Look, json.loads(str(own["look"])), "look")
             self._look_random.bit_generator.state = json.loads(str(own["look_random"]))
         self._take(own["observation"])
         self._begun, self._running = True, bool(own["running"])
+
+    def _own_state(self) -> dict[str, np.ndarray]:
+        """What a saved state holds beside simulation and task, by name."""
+        arrays = {
+            "random": np.array(json.dumps(self.np_random.bit_generator.state)),
+            "observation": self._observation.copy(),
+            "running": np.array(self._running),
+        }
+        if self._look_ranges is not None:
+            look = None if self._look is None else asdict(self._look)
+            arrays["look"] = np.array(json.dumps(look))
+            arrays["look_random"] = np.array(json.dumps(self._look_random.bit_generator.state))
+        return arrays
+
+    def _maker(self) -> str:
+        return state_maker(type(self).__name__, self.scene, self._mesh)
 
     def _draw_look(self, seed: int | None) -> None:
         """Draw the look of the next episode; a seed begins the random numbers of looks anew."""
@@ -338,25 +360,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._look = draw_look(ranges, self._look_random)
 
     def _draw(self) -> None:
-        """Draw episodes until the task accepts one."""
-        for _ in range(DRAWS_MOST):
-            if self.task.family is not None:
-                self.task.take_anatomy(self.task.family.draw(self.np_random))
-                self.simulation.take_anatomy(self.task.anatomy)
-            start = self.task.reset(self.np_random)
-            self.simulation.reset(start.organ, start.tip_position)
-            self.simulation.draw_motion(self.np_random)
-            if self.task.accepts(self.simulation):
-                return
-        raise ValueError(
-            f"scene {self.scene.name!r}: none of {DRAWS_MOST} draws is an episode that the task accepts: "
-            "narrow the ranges of the scene's draw"
-        )
-
-    def _advance(self) -> float:
-        """Advance the simulation by what a step lasts; returns the largest contact force [N]."""
-        count = self.scene.timing.haptic_steps_per_control
-        return self.simulation.control_step(count, self.task.force_limit, self.task.pull_limit)
+        """Draw an episode."""
+        self.runtime.reset(self.simulation, self.np_random)
 
     def _take(self, values: NDArray[np.floating]) -> None:
         """Take the task's numbers as the last observation; its picture is of this moment too."""
@@ -391,35 +396,13 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _shown(self) -> Shown:
         if not self._begun:
             raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
-        target = self.task.target
+        target, endoscope = self.task.pictured.target, self.task.pictured.endoscope
         moved = None if target is None else target.moved(self.simulation.ground_shift(target.centre))
-        return Shown(self.task.lesions, moved, self.task.endoscope, self._look, self.task.step_count)
+        return Shown(self.task.lesions, moved, endoscope, self._look, self.task.step_count)
 
     def _show(self) -> None:
         if self.render_mode == "human":
             self._view.show(self._shown())
-
-    def _maker(self) -> str:
-        """What a saved state must agree with: the kind of environment, its scene and mesh, the rates, the version."""
-        scene, mesh = self.scene, self._mesh
-        digest = scene_digest(scene, mesh, size=4)
-        return (
-            f"{type(self).__name__} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
-            f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, digest {digest}), "
-            f"version {STATE_VERSION}"
-        )
-
-    def _checked(self, action: Action | FloatArray) -> FloatArray:
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != self.action_space.shape:
-            raise ValueError(f"action has shape {values.shape}; the rule is {self.action_space.shape}")
-        bad = np.flatnonzero(~(np.abs(values) <= 1.0 + ACTION_SLACK))
-        if bad.size:
-            raise ValueError(
-                f"action[{bad[0]}] is {values[bad[0]]}; every entry must be finite and in [-1, 1]: "
-                "wrap the environment in gymnasium.wrappers.ClipAction"
-            )
-        return values
 
     def _out_of_bounds(self, values: FloatArray) -> str:
         single = values.astype(np.float32)
@@ -428,13 +411,13 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             return ""
         index = int(bad[0])
         return (
-            f"observation {self.task.entry_name(index)} = {values[index]:g} left its bounds, {self._low[index]:g} to "
+            f"observation {self.layout.entry_name(index)} = {values[index]:g} left its bounds, {self._low[index]:g} to "
             f"{self._high[index]:g}"
         )
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
         residual = self.simulation.instrument.trocar_residual
-        member = {} if self.task.family is None else {"member": str(self.task.anatomy.member)}
+        member = {} if self.runtime.family is None else {"member": str(self.task.anatomy.member)}
         return {
             "sim_fault": fault,
             "sensor_saturated": saturated,
@@ -445,21 +428,3 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }
-
-
-def _unpacked(state: bytes, *, made_by: str) -> dict[str, np.ndarray]:
-    """The arrays of a saved state, whose entry `made_by` must be this one.
-
-    Raises:
-        ValueError: bytes that are no saved state, or one that another environment made (names both).
-    """
-    try:
-        with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-            arrays = dict(archive)
-        maker = str(arrays["made_by"])
-    except Exception as error:
-        # Damaged bytes raise any of a dozen kinds in zipfile and numpy, from KeyError to NotImplementedError.
-        raise ValueError(f"not a saved state, as save_state gives it ({type(error).__name__}: {error})") from None
-    if maker != made_by:
-        raise ValueError(f"the state was saved by {maker}, this is {made_by}: use the same scene")
-    return arrays

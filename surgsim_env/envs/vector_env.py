@@ -2,27 +2,29 @@
 
 import math
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import iterate
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from msdm_core.kernels.vector_kernels import lane_counts
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.envs import ids
 from surgsim_env.envs.surgical_env import SurgicalEnv
 
 
-class LaneVectorEnv(SyncVectorEnv):
+class LaneVectorEnv(VectorEnv):
     """Environments of one scene, stepped together; each gives what it would give alone.
 
-    Everything but the control step itself is `SyncVectorEnv`'s: resets, autoreset modes, infos, spaces. In float64 each
-    environment equals a single one to the bit, whatever its neighbours do.
+    Autoreset modes, infos and spaces are those of Gymnasium's `SyncVectorEnv`. In float64 each environment equals a
+    single one to the bit, whatever its neighbours do.
 
         envs = gym.make_vec("SurgSim/Palpate-v0", num_envs=16, vectorization_mode="vector_entry_point")
 
@@ -35,6 +37,13 @@ class LaneVectorEnv(SyncVectorEnv):
         max_episode_steps: control steps until truncation, at most the environment's own number.
         render_mode: None, or "rgb_array": `render()` gives a tuple of pictures, drawn with shared graphics.
         settings: what a single environment takes, such as scene, instrument and level, by name.
+
+    Attributes:
+        envs: the environment of each lane
+
+    Raises:
+        ValueError: an unknown autoreset_mode, max_episode_steps below 1, a window for several environments, or what a
+            single environment refuses.
     """
 
     # The environment of each lane, which a subclass says.
@@ -53,31 +62,37 @@ class LaneVectorEnv(SyncVectorEnv):
     ) -> None:
         if render_mode == "human" and num_envs != 1:
             raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
-
-        def make() -> gym.Env:
-            env = self.single(render_mode=render_mode, **settings)
-            if max_episode_steps is None or max_episode_steps >= (env.task.episode_steps or math.inf):
-                return env
-            return gym.wrappers.TimeLimit(env, max_episode_steps)
-
-        super().__init__([make] * num_envs, autoreset_mode=autoreset_mode)
-        self._singles: list[SurgicalEnv] = [env.unwrapped for env in self.envs]  # type: ignore[misc]
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps is {max_episode_steps}; it must be at least 1, or None")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.envs = [self.single(render_mode=render_mode, **settings) for _ in range(num_envs)]
+        first = self.envs[0]
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.metadata = {**first.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        own_steps = first.task.episode_steps or math.inf
+        # The environment truncates an episode of its own number of steps by itself.
+        self._step_limit = math.inf if (max_episode_steps or math.inf) >= own_steps else max_episode_steps
         threads = threads if threads is not None else core_count()
         width = group_width(num_envs, np.dtype(dtype), threads)
         self._members = [range(first, min(first + width, num_envs)) for first in range(0, num_envs, width)]
         self._groups = [
-            LaneGroup([self._singles[index].simulation for index in members], np.dtype(dtype).type, width)
+            LaneGroup([self.envs[lane].simulation for lane in members], np.dtype(dtype).type, width)
             for members in self._members
         ]
         self._pool = ThreadPoolExecutor(max_workers=min(len(self._groups), threads))
-        self._paused = np.zeros(num_envs, dtype=np.bool_)
+        # The last observation of each lane, and the lanes whose episode is over.
+        self._observations: list[Any] = [None] * num_envs
+        self._over, self._paused = np.zeros((2, num_envs), dtype=np.bool_)
         # The threads live in this process alone: a forked child has none of them, and would wait for them for ever.
         self._process = os.getpid()
 
     @property
     def observation_slices(self) -> dict[str, slice]:
         """The entries of an observation that each channel has: `observations[:, observation_slices["time_left"]]`."""
-        return self._singles[0].observation_slices
+        return self.envs[0].observation_slices
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -86,14 +101,30 @@ class LaneVectorEnv(SyncVectorEnv):
 
         One that is reset is paused no more.
 
+        Args:
+            seed: of the first environment, with the next numbers for the others; or one for each.
+            options: "reset_mask", bool of shape (num_envs,), and what a single environment takes.
+
         Raises:
             RuntimeError: a forked child calls it; see `step`.
+            ValueError: another number of seeds, or a mask of another shape or type.
         """
         self._check_process()
-        begins = (options or {}).get("reset_mask")
-        given = super().reset(seed=seed, options=options)
-        self._paused[slice(None) if begins is None else begins] = False
-        return given
+        options = dict(options or {})
+        begins = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
+        if begins.shape != (self.num_envs,) or begins.dtype != np.bool_:
+            raise ValueError(f"reset_mask is {begins.dtype} {begins.shape}; the rule is bool ({self.num_envs},)")
+        seeds = [None] * self.num_envs if seed is None else seed
+        if isinstance(seeds, int):
+            seeds = [seeds + lane for lane in range(self.num_envs)]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds are given for {self.num_envs} environments: give one for each")
+        infos: dict[str, Any] = {}
+        for lane in np.flatnonzero(begins).tolist():
+            self._observations[lane], info = self.envs[lane].reset(seed=seeds[lane], options=options)
+            enter_info(infos, info, lane, self.num_envs)
+        self._over[begins] = self._paused[begins] = False
+        return self._together(), infos
 
     def pause(self, mask: NDArray[np.bool_]) -> None:
         """Leave the environments that a mask (n,) names as they are in each `step`, until a reset of mode "Disabled".
@@ -108,38 +139,59 @@ class LaneVectorEnv(SyncVectorEnv):
 
         Raises:
             RuntimeError: a forked child calls it, where the threads that advance the organs do not run.
+            ResetNeeded: an episode is over, and the mode does not reset it (names the lane).
+            ValueError: names the lane and the entry of the action that is out of bounds; no environment has moved.
         """
         self._check_process()
-        active = np.zeros(self.num_envs, dtype=np.bool_)
-        for index, action in enumerate(iterate(self.action_space, actions)):
-            resets = self._autoreset_envs[index] and self.autoreset_mode is AutoresetMode.NEXT_STEP
-            if not (resets or self._paused[index]):
-                self._command(index, action)
-                active[index] = True
+        resets = self._over & ~self._paused & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
+        moving = self._checked(actions, ~(resets | self._paused))
+        for lane, action in moving.items():
+            self.envs[lane].begin(action)
 
-        def advance(group: LaneGroup, members: range) -> None:
-            moves = active[members.start : members.stop]
-            if moves.any():
-                self._advance(group, members, moves)
+        def advance(lanes: LaneGroup, members: range) -> None:
+            if group := [self.envs[lane] for lane in members if lane in moving]:
+                group[0].advance(group, lanes)
 
         list(self._pool.map(advance, self._groups, self._members))
-        if not self._paused.any():
-            return super().step(actions)
-        return self._step_others(actions)
+        rewards, infos = np.zeros(self.num_envs), dict[str, Any]()
+        terminated, truncated = np.zeros((2, self.num_envs), dtype=np.bool_)
+        for lane, env in enumerate(self.envs):
+            info: dict[str, Any] = {}
+            if lane in moving:
+                seen, rewards[lane], terminated[lane], truncated[lane], info = env.finish()
+                truncated[lane] |= env.task.step_count >= self._step_limit
+                self._observations[lane], self._over[lane] = seen, terminated[lane] or truncated[lane]
+                if self._over[lane] and self.autoreset_mode is AutoresetMode.SAME_STEP:
+                    enter_info(infos, {"final_obs": seen, "final_info": info}, lane, self.num_envs)
+                    resets[lane] = True
+            if resets[lane]:
+                self._observations[lane], info = env.reset()
+                self._over[lane] = False
+            enter_info(infos, info, lane, self.num_envs)
+        return self._together(), rewards, terminated, truncated, infos
 
-    def _step_others(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """`SyncVectorEnv.step`, with stand-ins for the environments that are paused."""
-        envs = self.envs
-        self._autoreset_envs[self._paused] = False
-        try:
-            stand_ins: list[Any] = [
-                _Standstill(seen) if paused else env
-                for env, seen, paused in zip(envs, self._env_obs, self._paused, strict=True)
-            ]
-            self.envs = stand_ins
-            return super().step(actions)
-        finally:
-            self.envs = envs
+    def render(self) -> tuple[NDArray[np.uint8] | None, ...]:  # type: ignore[override]
+        """The picture of each environment."""
+        return tuple(env.render() for env in self.envs)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the threads and close the environments."""
+        self._pool.shutdown()
+        for env in self.envs:
+            env.close()
+
+    def _checked(self, actions: Any, moves: NDArray[np.bool_]) -> dict[int, FloatArray]:
+        """The actions of the lanes that move (n,), by lane."""
+        values = np.asarray(actions, dtype=np.float64)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"actions have shape {values.shape}; the rule is {self.action_space.shape}")
+        moving = np.flatnonzero(moves).tolist()
+        for lane in moving:
+            if self._over[lane]:
+                raise gym.error.ResetNeeded(
+                    f"lane {lane}: the episode is over: reset it with options={{'reset_mask': mask}}, or pause it"
+                )
+        return {lane: self.envs[lane].checked(values[lane], lane) for lane in moving}
 
     def _check_process(self) -> None:
         if (child := os.getpid()) != self._process:
@@ -149,37 +201,31 @@ class LaneVectorEnv(SyncVectorEnv):
                 'with gym.make_vec in the worker\'s own function, or start workers with the method "spawn"'
             )
 
-    def _command(self, index: int, action: Any) -> None:
-        """Give an environment's instrument the commands of an action."""
-        self._singles[index].command(action)
-
-    def _advance(self, group: LaneGroup, members: range, active: NDArray[np.bool_]) -> None:
-        """Advance the active of a group's environments (n,) by what a step lasts."""
-        first = self._singles[members.start]
-        count = first.scene.timing.haptic_steps_per_control
-        group.control_step(active, count, first.task.force_limit, first.task.pull_limit)
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Stop the threads and close the environments."""
-        self._pool.shutdown()
-        super().close_extras(**kwargs)
+    def _together(self) -> Any:
+        """The last observations of all environments."""
+        space = self.single_observation_space
+        return concatenate(space, self._observations, create_empty_array(space, n=self.num_envs))
 
 
-class _Standstill(NamedTuple):
-    """In place of an environment that is paused: its step gives the last observation, and nothing happens."""
-
-    observation: Any
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return self.observation, 0.0, False, False, {}
+def enter_info(infos: dict[str, Any], info: Mapping[str, Any], lane: int, count: int) -> None:
+    """Add the info of a lane to that of all: for each name an array (count,), and as "_name" the lanes that have it."""
+    for name, value in info.items():
+        if isinstance(value, Mapping):
+            enter_info(infos.setdefault(name, {}), value, lane, count)
+        else:
+            if name not in infos:
+                kind = type(value) if isinstance(value, bool | int | float | np.number) else object
+                infos[name] = np.full(count, None) if kind is object else np.zeros(count, dtype=kind)
+            infos[name][lane] = value
+        infos.setdefault(f"_{name}", np.zeros(count, dtype=np.bool_))[lane] = True
 
 
 @cache
 def vector_class(single: type[SurgicalEnv]) -> type[LaneVectorEnv]:
     """The vector environment of an environment class."""
     name = single.__name__.removesuffix("Env") + "VectorEnv"
-    told = {"single": single, "__module__": single.__module__, "__doc__": single.__doc__}
-    return type(name, (LaneVectorEnv,), told)
+    own = {"single": single, "__module__": single.__module__, "__doc__": single.__doc__}
+    return type(name, (LaneVectorEnv,), own)
 
 
 def __getattr__(name: str) -> Any:

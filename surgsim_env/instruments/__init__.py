@@ -1,4 +1,4 @@
-"""Instruments as MuJoCo bodies: probe, grasper, jaws and supports, and the arms that carry them."""
+"""Instruments as MuJoCo bodies: probe, grasper, jaws, supports and robot arms."""
 
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.instruments.arm.arm_instrument import ArmInstrument, check_port_outside, parked_place
@@ -6,7 +6,7 @@ from surgsim_env.instruments.arm.inverse_kinematics import PoseSolution, solve_p
 from surgsim_env.instruments.arm.model import compile_arm, position_actuator, read_model, read_xml
 from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.instruments.arm.steering import SteeredArm
-from surgsim_env.instruments.arm.urdf import MESH_FORMATS, faulty_links, find_mesh, mesh_names, speed_limits
+from surgsim_env.instruments.arm.urdf import MESH_FORMATS, find_mesh, mesh_names
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
@@ -23,7 +23,6 @@ __all__ = [
     "ToolBodies",
     "check_port_outside",
     "compile_arm",
-    "faulty_links",
     "find_mesh",
     "load_arm",
     "mesh_names",
@@ -32,5 +31,4 @@ __all__ = [
     "read_model",
     "read_xml",
     "solve_pose",
-    "speed_limits",
 ]

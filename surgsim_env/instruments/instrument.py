@@ -1,4 +1,4 @@
-"""What a simulation and a task ask of any instrument in MuJoCo: steer its tip and jaw, read it, save its state."""
+"""Interface of instruments in MuJoCo for simulations and tasks: control of tip and jaw, readings, saved state."""
 
 from dataclasses import dataclass
 
@@ -10,27 +10,27 @@ from msdm_core.arithmetic import dot, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
-# From open to closed [s].
+# Time from open to closed [s].
 STROKE_TIME = 0.5
 # The pads of a jaw at rest face each other along UP as closely as possible; along UP_ELSE if the jaw points along UP.
 UP, UP_ELSE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
 
 
 class Jaw:
-    """Two fingers of an instrument, each a tool of its own, commanded by a target from -1 (closed) to 1 (open).
+    """Two fingers of an instrument, each a tool, commanded by a target from -1 (closed) to 1 (open).
 
-    The servo moves the fingers' position targets at a speed that takes 0.5 s from closed to open. The force (or torque)
-    range of the fingers' joints in the model limits how hard they press.
+    The servo moves the fingers' position targets in STROKE_TIME from closed to open. The force (or torque) range of the
+    fingers' joints in the model limits their force.
 
     Fields:
         tools: the two fingers, as tools of the instrument                       (2,)
         shapes: their pads, as contact shapes of the instrument                  (2,)
-        has_pads: whether these are flat (boxes), made to hold tissue
+        has_pads: True if these are flat (boxes), for a hold on tissue
         closed, opened: values of the fingers' joints at -1 and at 1 [rad or m]  (2,)
     """
 
     def __init__(self, instrument: ToolBodies, joints: tuple[str, ...], places: NDArray[np.int64]) -> None:
-        """Take the two fingers' joints of an instrument, which open upwards, and their places in its servo (2,).
+        """Take the two fingers' joints of an instrument, opening upwards, and their indices in its servo (2,).
 
         Raises:
             ValueError: not two fingers, or a finger without a contact geom.
@@ -42,7 +42,7 @@ class Jaw:
         bodies = model.jnt_bodyid[index]
         for body in bodies:
             if model.body(body).name not in instrument.tool_names:
-                raise ValueError(f"finger {model.body(body).name!r} has no contact geom: tissue would not feel it")
+                raise ValueError(f"finger {model.body(body).name!r} has no contact geom: it would pass through tissue")
         self._instrument, self._places = instrument, places
         self.tools = np.array([instrument.tool_names.index(model.body(body).name) for body in bodies], dtype=np.int32)
         self.shapes = np.array([np.flatnonzero(instrument.shapes.shape_tool == tool)[0] for tool in self.tools])
@@ -58,8 +58,8 @@ class Jaw:
     @property
     def target(self) -> float:
         """Current position target of the fingers, from -1 (closed) to 1 (open)."""
-        now = self._instrument.data.ctrl[self._controls[0]]
-        return float(2.0 * (now - self.closed[0]) / (self.opened[0] - self.closed[0]) - 1.0)
+        first = self._instrument.data.ctrl[self._controls[0]]
+        return float(2.0 * (first - self.closed[0]) / (self.opened[0] - self.closed[0]) - 1.0)
 
     @property
     def friction(self) -> FloatArray:
@@ -84,7 +84,7 @@ class Jaw:
         return float(matmul(second - first, mean) / norm(mean) - self._half_thickness.sum())
 
     def command(self, target: float) -> None:
-        """Command the fingers to a target from -1 (closed) to 1 (open), which they hold.
+        """Command the fingers to a target from -1 (closed) to 1 (open), and hold it.
 
         Raises:
             ValueError: a target outside that range.
@@ -100,7 +100,7 @@ class Jaw:
         servo.upper[self._places] = np.where(goal > now, goal, self.opened)
 
     def rest(self) -> None:
-        """Drop any command: a jaw with pads is open, another one stays as MuJoCo's data have it.
+        """Drop any command; a jaw with pads is opened, another jaw keeps MuJoCo's data.
 
         The caller brings MuJoCo's positions up to date.
         """
@@ -137,15 +137,15 @@ def frame_along(direction: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Grasp:
-    """A jaw's hold on tissue, computed from the contact forces of one haptic step.
+    """Hold of a jaw on tissue, from the contact forces of one haptic step.
 
     Args:
         opening: gap between the pads at their middles [m].
         grip_force: the smaller of the tissue's two forces along the pads' own normals [N].
         pull_force: size of the sum of the tissue's forces on both fingers [N].
-        friction_left: friction in reserve, mu (N1 + N2) - (T1 + T2) [N], where N and T are each pad's normal and
+        friction_left: friction in reserve, mu (N1 + N2) - (T1 + T2) [N], with N and T each pad's normal and
             tangential force; at 0 or below the tissue slips.
-        holds: whether tissue presses both pads.
+        holds: True if tissue presses both pads.
     """
 
     opening: float
@@ -156,7 +156,7 @@ class Grasp:
 
 
 def read_grasp(jaw: Jaw | None, wrench: FloatArray, friction: float) -> Grasp | None:
-    """The grasp of a jaw at the current poses of its instrument; None without a jaw.
+    """Grasp of a jaw at the current poses of its instrument; None without a jaw.
 
     Args:
         jaw: of an instrument.
@@ -180,11 +180,11 @@ def read_grasp(jaw: Jaw | None, wrench: FloatArray, friction: float) -> Grasp | 
 
 
 class Instrument(ToolBodies):
-    """A tool that is steered by its tip's velocity within a box; its servo moves joint targets.
+    """Tool with a commanded tip velocity within a box; its servo moves joint targets.
 
     Fields:
-        lower, upper: the box that the tip may move in [m]                       (3,)
-        parked: where the tip waits before the first reset [m]                   (3,)
+        lower, upper: the box of the tip [m]                                     (3,)
+        parked: position of the tip before the first reset [m]                   (3,)
         jaw: None without one
         turning_size: size of the angular velocity command: 0 if the tip does not turn, 1 about a hinge, 3 in space
     """
@@ -203,13 +203,13 @@ class Instrument(ToolBodies):
 
     @property
     def workspace_limited(self) -> bool:
-        """Whether the servo's targets were stopped at a limit in the last haptic step."""
-        # The last joints are those of jaws, whose servo stops at the jaw's target.
+        """True if a servo's target was stopped at a limit in the last haptic step."""
+        # The last joints are those of jaws: their servo stops at the jaw's target.
         return bool(self.servo.limited[: len(self.servo.limited) - 2 * len(self.jaws)].any())
 
     @property
     def trocar_residual(self) -> float | None:
-        """Distance of the shaft's axis from the trocar [m]; None for an instrument that passes through none."""
+        """Distance of the shaft's axis from the trocar [m]; None for an instrument without one."""
         return None
 
     @property
@@ -230,7 +230,7 @@ class Instrument(ToolBodies):
         return data.site_xpos[self._tip].copy(), quaternion
 
     def place(self, position: FloatArray) -> None:
-        """Place the tip at rest at a position [m]; all else is as when loaded, and a jaw with pads is open."""
+        """Place the tip at rest at a position [m] and reset all else; a jaw with pads is open."""
         raise NotImplementedError
 
     def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
@@ -238,7 +238,7 @@ class Instrument(ToolBodies):
         raise NotImplementedError
 
     def command_jaw(self, target: float) -> None:
-        """Command the jaw to a target from -1 (closed) to 1 (open), which it approaches at limited speed and holds.
+        """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.
 
         Raises:
             ValueError: no jaw, or a target outside that range.
@@ -248,7 +248,7 @@ class Instrument(ToolBodies):
         self.jaw.command(target)
 
     def turning_of(self, turning: FloatArray | None) -> FloatArray:
-        """Angular velocity command of the tip [rad/s], (turning_size,); zeros if none is given.
+        """Angular velocity command of the tip [rad/s], (turning_size,); zeros for None.
 
         Raises:
             ValueError: a wrong number of values.
@@ -265,14 +265,14 @@ class Instrument(ToolBodies):
         mujoco.mj_comVel(self.model, self.data)
 
     def warning(self) -> str:
-        """The first MuJoCo warning raised since the last reset, or an empty string."""
+        """First MuJoCo warning since the last reset, or an empty string."""
         for kind in range(mujoco.mjtWarning.mjNWARNING):
             if self.data.warning[kind].number:
                 return f"MuJoCo warning {mujoco.mjtWarning(kind).name}"
         return ""
 
     def get_state(self) -> FloatArray:
-        """The whole state of the instrument, command included, as one vector."""
+        """Whole state of the instrument, with its command, as a vector."""
         signature = mujoco.mjtState.mjSTATE_INTEGRATION
         state = np.empty(mujoco.mj_stateSize(self.model, signature))
         mujoco.mj_getState(self.model, self.data, state, signature)
@@ -297,5 +297,5 @@ class Instrument(ToolBodies):
         self.jaw, self.jaws = jaw, jaw.tools[None]
 
     def _where(self) -> str:
-        """The instrument's name in error messages."""
+        """Name of the instrument in error messages."""
         return f"instrument {self.model.names.split(bytes(1))[0].decode()!r}"

@@ -1,4 +1,4 @@
-"""Instruments that a scene names: one arm, two, or a Cartesian tip on slides, a ball (probe) or a jaw (grasper)."""
+"""Instruments of a scene: one arm, two, or a Cartesian tip on slides, a ball (probe) or a jaw (grasper)."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ FINGERS = ("finger_upper", "finger_lower")
 
 
 class Probe(Instrument):
-    """A Cartesian probe of a scene, placed in the world frame: slide coordinates are the tip's position."""
+    """Cartesian probe of a scene; slide coordinates are the tip's position in the world."""
 
     def __init__(self, scene: Scene, lower: FloatArray, upper: FloatArray) -> None:
         """Load the scene's model; the tip moves in the box from lower to upper [m] and is parked at `upper`."""
@@ -29,23 +29,23 @@ class Probe(Instrument):
         self.servo = make_servo(lower, upper, np.arange(3), np.arange(3, 6))
 
     def place(self, position: FloatArray) -> None:
-        """Place the tip at rest at a position [m]; all else is as when loaded."""
+        """Place the tip at rest at a position [m] and reset all else."""
         self._rest()
         self.data.qpos[:3] = position
         self.data.ctrl[:3] = position
         mujoco.mj_forward(self.model, self.data)
 
     def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
-        """Command the tip's velocity [m/s], shape (3,); a probe does not turn."""
+        """Command the tip's velocity [m/s] (3,); a probe does not turn."""
         self.turning_of(turning)
         self.servo.command[:] = velocity
 
 
 class Grasper(Instrument):
-    """A jaw on a shaft along the scene's approach, turned by a wrist hinge and carried by three slides.
+    """Jaw on a shaft along the scene's approach, with a wrist hinge and three slides.
 
-    The hinge is behind the tip. Once per control step `command_velocity` computes the slide positions that bring the
-    tip to its target at the end of the step, with the hinge turned, and commands the constant speeds that lead there.
+    The hinge is behind the tip. Once per control step `command_velocity` computes the slide positions for the tip's
+    target at the end of the step, with the hinge turned, and commands constant speeds towards them.
     """
 
     turning_size = 1
@@ -54,7 +54,7 @@ class Grasper(Instrument):
         """Load the scene's model; the tip moves in the box from lower to upper [m] and is parked at `upper`.
 
         Raises:
-            ValueError: the scene's tip_direction needs the hinge beyond its range.
+            ValueError: the scene's tip_direction is beyond the hinge's range.
         """
         approach = np.asarray(scene.instrument.approach)
         self._rotation = frame_along(approach)
@@ -72,7 +72,7 @@ class Grasper(Instrument):
 
     @property
     def workspace_limited(self) -> bool:
-        """Whether the box or the hinge's range stopped the commanded motion of the tip."""
+        """True if the box or the hinge's range stopped the commanded motion of the tip."""
         return self._short or super().workspace_limited
 
     @property
@@ -98,16 +98,16 @@ class Grasper(Instrument):
         """
         duration, joints = self._control_step, self.data.ctrl[:4]
         low, high = self.servo.lower[3], self.servo.upper[3]
-        turned = joints[3] + float(self.turning_of(turning)[0]) * duration
-        pitch = min(max(turned, low), high)
-        wanted = joints[:3] + self._tip_from_hinge(joints[3]) + np.asarray(velocity, dtype=np.float64) * duration
-        held = np.clip(wanted, self.lower, self.upper)
-        self._short = bool(pitch != turned or (held != wanted).any())
+        target_pitch = joints[3] + float(self.turning_of(turning)[0]) * duration
+        pitch = min(max(target_pitch, low), high)
+        target = joints[:3] + self._tip_from_hinge(joints[3]) + np.asarray(velocity, dtype=np.float64) * duration
+        held = np.clip(target, self.lower, self.upper)
+        self._short = bool(pitch != target_pitch or (held != target).any())
         self.servo.command[:3] = (held - self._tip_from_hinge(pitch) - joints[:3]) / duration
         self.servo.command[3] = (pitch - joints[3]) / duration
 
     def get_state(self) -> FloatArray:
-        """The whole state of the instrument, command included, as one vector."""
+        """Whole state of the instrument, with its command, as a vector."""
         return np.append(super().get_state(), float(self._short))
 
     def set_state(self, state: FloatArray) -> None:
@@ -122,7 +122,7 @@ class Grasper(Instrument):
         return matmul(self._rotation, np.array([0.0, c * y - s * z, s * y + c * z]))
 
     def _pitch_towards(self, direction: tuple[float, float, float]) -> float:
-        """Angle of the hinge at which the jaw points along a direction as closely as possible [rad]."""
+        """Angle of the hinge for a jaw along a direction as closely as possible [rad]."""
         _, y, z = matmul(self._rotation.T, np.asarray(direction))
         pitch = float(arctan2(y, -z))
         low, high = self.model.joint("pitch").range
@@ -138,9 +138,9 @@ def read_model(name: str) -> mujoco.MjSpec:
     """Read the model of a Cartesian instrument, one of CARTESIAN in scenes/instruments.
 
     Raises:
-        ValueError: another name (lists those there are).
+        ValueError: another name (lists the known ones).
     """
-    known = sorted(f"{one}.xml" for one in CARTESIAN)
+    known = sorted(f"{name}.xml" for name in CARTESIAN)
     if name not in known:
         raise ValueError(
             f"instrument {name!r} is unknown; the instruments are {', '.join(known)}, and arms by name or TOML file"
@@ -187,10 +187,10 @@ def _compile_grasper(scene: Scene, rotation: FloatArray) -> mujoco.MjModel:
 
 
 def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> Instrument:
-    """The instrument of an anatomy's scene, whose tip may move in the box from lower to upper [m].
+    """Load the instrument of an anatomy's scene; its tip may move in the box from lower to upper [m].
 
     Raises:
-        ValueError: an unknown model; an arm that is wrongly described or does not reach the palpable face.
+        ValueError: an unknown model; an arm with a wrong description or without reach of the palpable face.
     """
     scene = anatomy.scene
     if pair_names(scene.instrument.model) is not None:
@@ -201,5 +201,5 @@ def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> I
         from surgsim_env.instruments.arm.arm_instrument import ArmInstrument
 
         return ArmInstrument(anatomy, lower, upper)
-    made = Grasper if read_model(scene.instrument.model).body("jaw") is not None else Probe
-    return made(scene, lower, upper)
+    kind = Grasper if read_model(scene.instrument.model).body("jaw") is not None else Probe
+    return kind(scene, lower, upper)

@@ -1,8 +1,8 @@
 """MuJoCo's functions under one name for Python and for compiled code.
 
 Python calls MuJoCo's own bindings, with an MjModel and an MjData. Compiled code calls the C function of the same name,
-with the addresses of mjModel and mjData. That function must be known to the linker first: `coupling.mujoco_library`
-sees to that, and whoever runs a compiled function that calls one of these asks it before.
+with the addresses of mjModel and mjData. The linker must know that function first: call `coupling.mujoco_library`
+before running a compiled function with one of these.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ _address, _index = types.uintp, types.int32
 
 
 def _c_function(name: str, *arguments: types.Type) -> Any:
-    """MuJoCo's C function of a name, which returns nothing."""
+    """MuJoCo's C function of a name, without a result."""
     return types.ExternalFunction(name, types.void(*arguments))
 
 

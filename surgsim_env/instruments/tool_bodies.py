@@ -1,4 +1,4 @@
-"""Bodies of a MuJoCo model that tissue feels: shapes, poses, twists, response to wrenches, minimum mass; supports."""
+"""Tools, the bodies of a MuJoCo model in contact with tissue: shapes, poses, twists, response, mass; supports."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from surgsim_env.instruments.tool_kernels import Servo, ToolViews
 
 IndexArray = NDArray[np.int64]
 
-# Geoms of this group are what tissue feels: spheres, capsules and boxes, whose edges are rounded.
+# Group of the geoms in contact with tissue: spheres, capsules and boxes with rounded edges.
 CONTACT_GROUP = 3
-# Prefix of a model's custom number (<numeric>) for the friction of a geom; the geom's name follows.
+# Prefix of a model's custom number (<numeric>) for a geom's friction; the geom's name follows.
 ROUGHNESS = "roughness_"
 SUPPORT_PREFIX = "support_"
-# Bit of the contact masks by which supports meet the tools' contact geoms, and nothing else.
+# Bit of the contact masks between supports and the tools' contact geoms.
 SUPPORT_BIT = 2
-# As soft as cloth over a soft base: 1500 N/m for a tool of 0.1 kg, more for a heavier one, critically damped.
+# As soft as cloth over a soft base: 1500 N/m for a tool of 0.1 kg, more for a heavier tool, critically damped.
 # MuJoCo's negative solref [1/s^2, 1/s] gives a contact of impedance 1/2 a stiffness of 2 x 7500 N/m per kilogram of
 # the tool.
 SOLREF = (-7500.0, -173.0)
@@ -40,7 +40,7 @@ _GEOMS = {
 
 
 def make_servo(lower: FloatArray, upper: FloatArray, position: IndexArray, speed: IndexArray) -> Servo:
-    """A servo at rest: limits of its joints [m or rad], indices of MuJoCo's position and speed controls, each (n,)."""
+    """Servo at rest with joint limits [m or rad] and indices of MuJoCo's position and speed controls, each (n,)."""
     return Servo(np.zeros(len(lower)), lower.copy(), upper.copy(), position, speed, np.zeros(len(lower), dtype=bool))
 
 
@@ -51,7 +51,7 @@ def _roughness(model: mujoco.MjModel, geom: int) -> float:
 
 
 def _implicit_damping(model: mujoco.MjModel) -> FloatArray:
-    """Damping that MuJoCo's implicit integrator adds to the joints' own [N s/m, N m s], (nv, nv).
+    """Damping of MuJoCo's implicit integrator beyond the joints' own [N s/m, N m s], shape (nv, nv).
 
     It comes from velocity servos of joints (also at the limit of their force) and from damped fixed tendons.
     """
@@ -71,15 +71,15 @@ def _implicit_damping(model: mujoco.MjModel) -> FloatArray:
 
 
 class ToolBodies:
-    """The tools of a MuJoCo model: every body that carries contact shapes.
+    """Tools of a MuJoCo model: the bodies with contact shapes.
 
-    A subclass sets the `servo` that drives joints; here it has none. Wrenches and twists refer to a body's centre of
+    A subclass sets the `servo` of its joints; here it has none. Wrenches and twists refer to a body's centre of
     mass, as `xfrc_applied` and `mj_objectVelocity` do. MuJoCo gives angular before linear velocities;
     `tool_kernels.read_shapes` swaps them, and nothing else does.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Find the tools of a model; the model is not changed."""
+        """Find the tools of a model, without changing it."""
         self.model = model
         self.data = mujoco.MjData(model)
         self._geoms = np.flatnonzero(model.geom_group == CONTACT_GROUP)
@@ -87,7 +87,7 @@ class ToolBodies:
         self._tools = np.unique(bodies)
         size, kind = model.geom_size[self._geoms], model.geom_type[self._geoms]
         box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
-        # The core of a box, which is rounded by its smallest half size, lies along its longest axis and spans the other
+        # The core of a box, rounded by its smallest half size, lies along its longest axis and spans the other
         # (thin, middle, long); other geoms lie along z, and their first size is the radius.
         order = np.where(box[:, None], np.argsort(size, axis=1, kind="stable"), np.array([[0, 1, 2]]))
         thin, middle, long = np.take_along_axis(size, order, axis=1).T
@@ -113,7 +113,7 @@ class ToolBodies:
 
     @property
     def tool_count(self) -> int:
-        """How many bodies carry contact shapes."""
+        """Number of tools."""
         return len(self._tools)
 
     @property
@@ -126,15 +126,15 @@ class ToolBodies:
         tool_kernels.drive_servo(self.views())
 
     def read_shapes(self) -> None:
-        """Read the current pose and twist of every contact shape into `shapes`; call after mj_step1."""
+        """Read the current pose and twist of each contact shape into `shapes`; call after mj_step1."""
         tool_kernels.read_shapes(self.views(), self.shapes)
 
     def read_response(self) -> None:
-        """Read how the tools move on without the tissue, and yield to it, into `response`; call after `drive`."""
+        """Read the tools' acceleration without tissue and their mobility into `response`; call after `drive`."""
         tool_kernels.read_response(self.views(), self.response)
 
     def damped_inertia(self, dt: float) -> FloatArray:
-        """M + dt D: joint-space inertia, armature included, and the joints' damping over dt [s], (nv, nv).
+        """M + dt D: joint-space inertia with armature, and the joints' damping over dt [s], shape (nv, nv).
 
         Overwritten by the next call.
         """
@@ -142,14 +142,14 @@ class ToolBodies:
         return self._inertia
 
     def jacobian(self, tool: int) -> FloatArray:
-        """From joint velocities to a tool's twist at its centre of mass, shape (6, nv); overwritten by its next."""
+        """Jacobian of a tool's twist at its centre of mass, shape (6, nv); overwritten by the tool's next call."""
         tool_kernels.read_jacobian(self.views(), tool)
         return self._jacobians[tool]
 
     def views(self, *, compiled: bool = False) -> ToolViews:
-        """What stepping these tools reads and writes, for compiled code or for Python; valid until `data` is replaced.
+        """Arrays of a step of these tools, for compiled code or for Python; valid until `data` is replaced.
 
-        Make it for each call: a copied instrument has data of its own.
+        Get them for each call: a copied instrument has data of its own.
         """
         model, data = self.model, self.data
         return ToolViews(
@@ -180,10 +180,10 @@ class ToolBodies:
 
 
 def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support], *, moving: bool = False) -> None:
-    """Add supports to a model's world as geoms `support_NAME`, in the scene's frame; its tools then meet them.
+    """Add supports to a model's world as geoms `support_NAME` in the scene's frame, in contact with its tools.
 
-    Supports that move are bodies of the same names, which `place_supports` moves. Without supports nothing changes.
-    Call it after every geom has its group and the world its final frame.
+    Moving supports are bodies of the same names for `place_supports`. Without supports nothing changes.
+    Call it after all geoms have their groups and the world has its final frame.
     """
     if not supports:
         return
@@ -215,15 +215,15 @@ def add_supports(spec: mujoco.MjSpec, supports: Sequence[Support], *, moving: bo
 
 
 def place_supports(model: mujoco.MjModel, data: mujoco.MjData, supports: Sequence[Support], shift: FloatArray) -> None:
-    """Move supports that were added as ones that move from their places by shifts [m] (n_support, 3)."""
-    for support, way in zip(supports, shift, strict=True):
+    """Displace moving supports from their places by shifts [m] (n_support, 3)."""
+    for support, offset in zip(supports, shift, strict=True):
         body = model.body(SUPPORT_PREFIX + support.name).mocapid[0]
-        data.mocap_pos[body] = np.asarray(support.position) + way
+        data.mocap_pos[body] = np.asarray(support.position) + offset
 
 
 @dataclass(frozen=True)
 class ToolMass:
-    """Effective mass of a tool at its contact shapes, and the minimum that the exchange needs.
+    """Effective mass of a tool at its contact shapes, and the minimum for the exchange.
 
     Args:
         name: the tool's body.
@@ -232,7 +232,7 @@ class ToolMass:
         mass: its least effective mass over the ends of its contact shapes and all directions [kg].
         damped_mass: the same for M + (dt / 2) D, with the damping D of its joints [kg].
         least_mass: minimum of `damped_mass` [kg].
-        least_damping: joint damping along the lightest direction that makes up for the mass [N s/m].
+        least_damping: joint damping along the lightest direction in place of the missing mass [N s/m].
     """
 
     name: str
@@ -245,28 +245,28 @@ class ToolMass:
 
 
 def contact_area(tools: ToolBodies, tool: int) -> float:
-    """Largest surface area that can push a tool [m^2]: the cross-sections of its shapes, pi r^2 + 2 r l + w (2 r + l).
+    """Largest contact area of a tool [m^2]: cross-sections of its shapes, pi r^2 + 2 r l + w (2 r + l).
 
     l and w are length and width of the core, 0 for a ball, w = 0 for a capsule.
 
     A surface pressed by k_p per area and penetration holds a shape with k_p int (e . u)^2 dA along u, e being the
     direction of the pressure. For a ball in a flat surface up to its centre that is half of pi r^2, for one with
-    tissue wrapped around its lower half two thirds; for a capsule's side pi / 4 of 2 r l. What the turning of the
-    pressure adds is smaller by penetration / radius.
+    tissue wrapped around its lower half two thirds; for a capsule's side pi / 4 of 2 r l. The effect of the turning
+    pressure is smaller by penetration / radius.
     """
-    mine = tools.shapes.shape_tool == tool
-    radius = tools.shapes.shape_radius[mine]
-    length = norm(np.diff(tools.shapes.shape_ends[mine], axis=1)[:, 0], axis=1)
-    width = 2.0 * norm(tools.shapes.shape_span[mine], axis=1)
+    own = tools.shapes.shape_tool == tool
+    radius = tools.shapes.shape_radius[own]
+    length = norm(np.diff(tools.shapes.shape_ends[own], axis=1)[:, 0], axis=1)
+    width = 2.0 * norm(tools.shapes.shape_span[own], axis=1)
     return float((np.pi * (radius * radius) + 2.0 * radius * (length + width) + width * length).sum())
 
 
 def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2) -> list[ToolMass]:
-    """Effective and minimum mass of each tool at the tools' current pose.
+    """Effective and minimum mass of each tool at its current pose.
 
     In the worst case a tool of mass m touches tissue too heavy to move within a haptic step dt: a spring k = k_p A and
     a damper c = c_p A, where A is `contact_area`, at most the organ's whole surface; k_t replaces k_p where sticking
-    friction is stiffer. An explicit exchange takes the force at the mean place x_n + v_n dt / 2 of a twist held through
+    friction is stiffer. An explicit exchange takes the force at the mean place x_n + v_n dt / 2 of a twist held over
     the step, v_(n+1) = v_n - (dt / m) (k (x_n + v_n dt / 2) + c v_n), x_(n+1) = x_n + dt v_(n+1). Its characteristic
     polynomial leaves the unit circle at z = -1, where 4 m = 2 k dt^2 + 2 c dt:
 
@@ -290,44 +290,44 @@ def tool_masses(tools: ToolBodies, contact: ContactLaw, surface_area: float, sub
     tools.read_shapes()
     dt = tools.model.opt.timestep
     stiffest = max(contact.stiffness, contact.tangential_stiffness if contact.friction > 0.0 else 0.0)
-    found: list[ToolMass] = []
+    masses: list[ToolMass] = []
     for tool, name in enumerate(tools.tool_names):
         area = min(contact_area(tools, tool), surface_area)
         stiffness, damping = stiffest * area, contact.damping * area
         mass, damped = (effective_mass(tools, tool, tools.damped_inertia(share * dt)) for share in (0.0, 0.5))
         ahead = 1.5 if substep_count == 1 else 1.0
         least = 0.5 * dt * (ahead * stiffness * dt + damping)
-        found.append(ToolMass(name, stiffness, damping, mass, damped, least, max(0.0, 2.0 * (least - mass) / dt)))
-    return found
+        masses.append(ToolMass(name, stiffness, damping, mass, damped, least, max(0.0, 2.0 * (least - mass) / dt)))
+    return masses
 
 
 def effective_mass(tools: ToolBodies, tool: int, inertia: FloatArray) -> float:
-    """Least mass of a tool at the ends of its shapes' axes, 1 / max eig(J M^-1 J^T) [kg], M (nv, nv) as given."""
+    """Least mass of a tool at the ends of its shapes' axes, 1 / max eig(J M^-1 J^T) [kg], for an inertia M (nv, nv)."""
     jacobian = tools.jacobian(tool)
     mobility = 0.0
-    mine = tools.shapes.shape_tool == tool
-    ends, span = tools.shapes.shape_ends[mine], tools.shapes.shape_span[mine][:, None]
+    own = tools.shapes.shape_tool == tool
+    ends, span = tools.shapes.shape_ends[own], tools.shapes.shape_span[own][:, None]
     for end in np.concatenate([ends - span, ends + span]).reshape(-1, 3):
         x, y, z = end - tools.shapes.tool_centre[tool]
         # Velocity of that end: v + omega x (x, y, z).
-        there = jacobian[:3] + matmul(np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), jacobian[3:])
-        mobility = max(mobility, float(eigh(matmul(there, solve(inertia, there.T)))[0][-1]))
+        at_end = jacobian[:3] + matmul(np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), jacobian[3:])
+        mobility = max(mobility, float(eigh(matmul(at_end, solve(inertia, at_end.T)))[0][-1]))
     return 1.0 / mobility if mobility > 0.0 else np.inf
 
 
 def check_tool_masses(
     scene: str, tools: ToolBodies, contact: ContactLaw, surface_area: float, substep_count: int = 2
 ) -> None:
-    """Refuse a tool that is too light for a stable exchange.
+    """Check that all tools are heavy enough for a stable exchange.
 
     Raises:
-        OrganError: a tool is too light (names it, its mass, the minimum mass, and the damping that would do instead).
+        OrganError: a tool is too light (names it, its mass, the minimum mass, and a sufficient damping).
     """
-    for found in tool_masses(tools, contact, surface_area, substep_count):
-        if found.damped_mass < found.least_mass:
+    for tool in tool_masses(tools, contact, surface_area, substep_count):
+        if tool.damped_mass < tool.least_mass:
             raise OrganError(
-                f"scene {scene!r}: tool {found.name!r} weighs {found.mass * 1e3:.3g} g at its tip, too little for a "
-                f"contact as stiff as {found.stiffness:.3g} N/m at steps of {tools.model.opt.timestep * 1e3:g} ms: the "
-                f"exchange would be unstable. Give it at least {found.least_mass * 1e3:.3g} g, or joints damped with "
-                f"{found.least_damping:.3g} N s/m, or lower contact.stiffness or timing.haptic_step"
+                f"scene {scene!r}: tool {tool.name!r} weighs {tool.mass * 1e3:.3g} g at its tip, too little for a "
+                f"contact as stiff as {tool.stiffness:.3g} N/m at steps of {tools.model.opt.timestep * 1e3:g} ms: the "
+                f"exchange would be unstable. Give it at least {tool.least_mass * 1e3:.3g} g, or joints damped with "
+                f"{tool.least_damping:.3g} N s/m, or lower contact.stiffness or timing.haptic_step"
             )

@@ -1,7 +1,7 @@
-"""The tools of a MuJoCo model: what drives them, where they are, and how they yield to a wrench.
+"""Tools of a MuJoCo model: servo, poses and response to wrenches, in Python and compiled.
 
-A function that calls MuJoCo (`mujoco_kernels`) is plain Python when called from Python, and compiled within a compiled
-function that calls it. The text is the same, so the bits are too.
+A function with calls of MuJoCo (`mujoco_kernels`) is plain Python when called from Python, and compiled within a
+compiled function. The text is the same, so the bits are too.
 """
 
 from typing import Any, NamedTuple
@@ -25,14 +25,14 @@ FloatArray = NDArray[np.float64]
 
 
 class Servo(NamedTuple):
-    """What drives an instrument's joints, slides or hinges: position targets that move on at the commanded speeds.
+    """Servo of an instrument's joints, slides or hinges: position targets moving at commanded speeds.
 
     Fields:
-        command: speed asked for [m/s or rad/s]                                  (n_joint,)
+        command: speed [m/s or rad/s]                                            (n_joint,)
         lower, upper: the workspace, or the joints' limits [m or rad]            (n_joint,)
-        position: which of MuJoCo's controls are the positions                   (n_joint,)
-        speed: which are the speeds; -1 where a joint has none                   (n_joint,)
-        limited: which joints the last step stopped at their limits              (n_joint,)
+        position: indices of the positions among MuJoCo's controls               (n_joint,)
+        speed: indices of the speeds; -1 for a joint without one                 (n_joint,)
+        limited: True for joints stopped at a limit in the last step             (n_joint,)
     """
 
     command: FloatArray
@@ -44,25 +44,25 @@ class Servo(NamedTuple):
 
 
 class ToolViews(NamedTuple):
-    """The tools of one MuJoCo model and data: views of MuJoCo's own arrays, and scratch arrays.
+    """Tools of one MuJoCo model and data: views of MuJoCo's own arrays, and scratch arrays.
 
-    Made for each call (`ToolBodies.views`), so that it never outlives or misses its data.
+    Get them for each call (`ToolBodies.views`): `data` may be replaced.
 
     Fields:
         model, data: MjModel and MjData; their addresses for compiled code
         timestep: [s]                                                            scalar
         geoms: contact shapes                                                    (n_shape,)
-        axis, half_length: which axis of the geom the core lies along, its half length [m]  (n_shape,), (n_shape,)
-        across, half_width: which axis of the geom a rounded box spans, its half width [m]  (n_shape,), (n_shape,)
+        axis, half_length: the geom's axis along the core, and half length [m]   (n_shape,), (n_shape,)
+        across, half_width: the geom's axis across a rounded box, half width [m] (n_shape,), (n_shape,)
         bodies: the tools                                                        (n_tool,)
         joint_damping: [N s/m, N m s]                                            (nv,)
-        implicit_damping: what MuJoCo adds to it implicitly, of velocity servos and tendons  (nv, nv)
+        implicit_damping: MuJoCo's further damping of velocity servos and tendons (nv, nv)
         geom_position, geom_rotation: of all geoms, world frame [m]              (n_geom, 3), (n_geom, 9)
         body_centre: centres of mass [m]                                         (n_body, 3)
         smooth_force: on the joints, without constraints [N, N m]                (nv,)
         applied_wrench: xfrc_applied [N, N m]                                    (n_body, 6)
         control: of all actuators                                                (nu,)
-        servo: what moves the controls
+        servo: of the controls
         jaws: the two fingers of each jaw, as tools                              (n_jaw, 2)
         velocity, jacobians, inertia, yielded: scratch             (6,), (n_tool, 6, nv), (nv, nv), (nv, 6)
     """
@@ -112,8 +112,8 @@ def tool_mobility(factors, jacobians, tool, smooth_force, yielded, mobility, acc
     Out:     mobility (n_tool, n_tool, 6, 6) [1/kg, ...], acceleration (n_tool, 6) [m/s^2, rad/s^2]
     Scratch: yielded = A^-1 J_t^T (nv, 6)
 
-    Tools of one arm share its joints: two fingers that tissue pushes apart leave the wrist where it is, which a
-    response of each to its own wrench alone would miss. The plain Python loop calls this too, because a library's
+    Tools of one arm share its joints: two fingers pushed apart by tissue leave the wrist in place, unlike with a
+    response of each to its own wrench alone. The plain Python loop calls this too, because a library's
     solver rounds differently.
     """
     count = factors.shape[0]
@@ -145,10 +145,10 @@ def tool_mobility(factors, jacobians, tool, smooth_force, yielded, mobility, acc
 
 @register_jitable(**JITABLE)
 def drive_servo(tools):
-    """Move the servo's targets on by one step at the commanded speeds; they stop at their limits.
+    """Move the servo's targets by one step at the commanded speeds; they stop at their limits.
 
     In:  tools.servo.command [m/s or rad/s], its limits [m or rad], tools.timestep [s]
-    Out: tools.control, tools.servo.limited: which joints were stopped
+    Out: tools.control, tools.servo.limited
     """
     servo, control = tools.servo, tools.control
     for joint in range(servo.command.shape[0]):
@@ -167,7 +167,7 @@ def drive_servo(tools):
 
 @register_jitable(**JITABLE)
 def read_shapes(tools, shapes):
-    """Read pose and twist of every contact shape of the current step; call after mj_step1.
+    """Read pose and twist of each contact shape in the current step; call after mj_step1.
 
     Out: shapes.shape_ends, shape_span, tool_centre [m], tool_twist [m/s, rad/s]; MuJoCo gives angular before linear
     """
@@ -190,7 +190,7 @@ def read_shapes(tools, shapes):
 
 @register_jitable(**JITABLE)
 def read_inertia(tools, dt):
-    """Read M + dt D: joint-space inertia, armature included, and the joints' damping D over dt [s].
+    """Read M + dt D: joint-space inertia with armature, and the joints' damping D over dt [s].
 
     Out: tools.inertia (nv, nv)
     """
@@ -212,9 +212,9 @@ def read_jacobian(tools, tool):
 
 @register_jitable(**JITABLE)
 def read_response(tools, response):
-    """Read how the tools move on without the tissue, and how they yield to it; call after `drive_servo`.
+    """Read the tools' acceleration without tissue and their mobility; call after `drive_servo`.
 
-    With the inertia M, the damping D that MuJoCo's integrator takes implicitly (of the joints, and
+    With the inertia M, the implicit damping D of MuJoCo's integrator (of the joints, and
     `tools.implicit_damping`) and the sum q of all forces but the tissue's, wrenches w_j on the tools j change the twist
     of tool i at the rate J_i (M + dt D)^-1 (q + sum_j J_j^T w_j). J are the tools' Jacobians: tools of one arm share
     its joints. Centripetal terms are left out, and MuJoCo's own contacts, which it counts at the step's end.

@@ -1,4 +1,4 @@
-"""Presses, contrast maps, lesion estimators and scores of palpation; `surgsim palpate`."""
+"""Palpation: presses, charts of faces, contrast maps, lesion estimators, errors."""
 
 from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE, TouchMap, healthy_file, interpolated, write_healthy_map
 from surgsim_env.palpation.lesion_estimator import (
@@ -11,23 +11,7 @@ from surgsim_env.palpation.lesion_estimator import (
     strongest_apart,
 )
 from surgsim_env.palpation.member_chart import member_map, still_template
-from surgsim_env.palpation.scores import (
-    CUTOFF,
-    ERROR_LINE,
-    EVALUATION_SEEDS,
-    FOUND_SHARE,
-    RESAMPLES,
-    MapScore,
-    PalpationRecord,
-    ScoreEstimate,
-    figure_with_interval,
-    ospa,
-    ospa_cutoff,
-    press_errors,
-    presses_to_line,
-    score,
-    with_intervals,
-)
+from surgsim_env.palpation.scores import CUTOFF, FOUND_SHARE, matched_distances, ospa, ospa_cutoff
 from surgsim_env.palpation.site_press import (
     HOLD_TIME,
     PRESS_SPEED,
@@ -43,8 +27,6 @@ from surgsim_env.palpation.touches import Indenter, stiffest_spots
 __all__ = [
     "BACKGROUND_SPREAD",
     "CUTOFF",
-    "ERROR_LINE",
-    "EVALUATION_SEEDS",
     "EXCESS_SPREAD",
     "FOUND_SHARE",
     "HOLD_TIME",
@@ -53,32 +35,24 @@ __all__ = [
     "MAP_SIDE",
     "ORGAN_MAP_SPREAD",
     "PRESS_SPEED",
-    "RESAMPLES",
     "Indenter",
     "LesionEstimator",
-    "MapScore",
-    "PalpationRecord",
     "Press",
-    "ScoreEstimate",
     "SitePress",
     "TouchMap",
     "contrast_process",
-    "figure_with_interval",
     "healthy_file",
     "interpolated",
+    "matched_distances",
     "member_map",
     "ospa",
     "ospa_cutoff",
     "press",
     "press_alone",
-    "press_errors",
     "press_phases",
-    "presses_to_line",
     "scan",
-    "score",
     "stiffest_spots",
     "still_template",
     "strongest_apart",
-    "with_intervals",
     "write_healthy_map",
 ]

@@ -1,4 +1,4 @@
-"""The chart of a palpable face, a grid of sites across the approach, and the healthy organ's stiffness at each."""
+"""Chart of a palpable face, a grid of sites across the approach, and the healthy organ's stiffness at the sites."""
 
 import contextlib
 import os
@@ -18,24 +18,24 @@ from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.site_press import SitePress, in_threads, press_in_lanes, press_phases
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy, with_added_mass, with_substeps
 from surgsim_env.scene.digest import PHYSICS_VERSION, content_digest
-from surgsim_env.scene.family import KEPT_MOST
+from surgsim_env.scene.family import CACHED_MOST
 from surgsim_env.scene.load import scenes_folder, with_instrument
 from surgsim_env.scene.model import Scene
 from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
 from surgsim_env.step_progress import StepProgress
 
-# Fewest and most sites on a side of the grid; an odd number has one in the middle.
+# Fewest and most sites on a side of the grid; an odd number has a site in the middle.
 SITES_FEWEST, SITES_MOST = 13, 25
-# Sites on a side of the touch map, the same for every organ, and their distance in tip radii; larger where that many
-# do not span the face.
+# Sites on a side of the touch map, the same for all organs, and their distance in tip radii; larger on a face beyond
+# that many.
 MAP_SIDE, MAP_CELL = 41, 0.4
 # Subdivisions of a cell of the grid in the table of surface points.
 POINTS_BETWEEN = 2
-# Rounding puts the chart's border slightly inside the margin: sites up to this [m] within it are accepted.
+# Tolerance of the margin [m]: rounding puts the chart's border slightly inside it.
 ROUNDING = 1e-9
-# Organs that are pressed side by side.
+# Number of vectorised organs by precision.
 LANES = {np.float64: 8, np.float32: 16}
-# Largest share of mass that is added to the organ of a patient's map.
+# Largest added share of mass of the organ of a patient's map.
 MASS_SHARE = 0.025
 # Environment variable with the cache's folder.
 FOLDER_VARIABLE = "SURGSIM_CACHE"
@@ -43,7 +43,7 @@ FOLDER_VARIABLE = "SURGSIM_CACHE"
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A rectangle, seen along the approach, that contains all places where a face may be pressed.
+    """Rectangle across the approach around all pressable places of a face.
 
     Fields:
         across, along: unit vectors of the plane, the chart's first and second axis                       (3,)
@@ -69,7 +69,7 @@ class Chart:
         return 2.0 * (plane - self.lower) / self.extent - 1.0
 
     def plane_point(self, place: ArrayLike) -> FloatArray:
-        """The point of the plane [m] (..., 2) at a place (..., 2) of the chart, the inverse of `place`."""
+        """Point of the plane [m] (..., 2) at a place (..., 2) of the chart, the inverse of `place`."""
         return self.lower + 0.5 * (np.asarray(place, dtype=np.float64) + 1.0) * self.extent
 
     @property
@@ -81,7 +81,7 @@ class Chart:
 
 
 def make_chart(face: PalpableFace, tip_radius: float) -> Chart:
-    """The chart of a face: the bounding rectangle less the margin, sites about half a tip's radius [m] apart.
+    """Chart of a face: the bounding rectangle less the margin, with sites about half a tip's radius [m] apart.
 
     Raises:
         ValueError: the margin leaves nothing of the face.
@@ -95,19 +95,19 @@ def make_chart(face: PalpableFace, tip_radius: float) -> Chart:
             f"palpation.face_margin of {face.margin * 1000:.3g} mm leaves nothing of a palpable face of "
             f"{' x '.join(f'{side * 1000:.3g}' for side in np.ptp(plane, axis=0))} mm: make it smaller"
         )
-    wanted = round(float((upper - lower).max()) / (0.5 * tip_radius)) + 1
-    count = min(max(wanted + (wanted + 1) % 2, SITES_FEWEST), SITES_MOST)
+    count = round(float((upper - lower).max()) / (0.5 * tip_radius)) + 1
+    count = min(max(count + (count + 1) % 2, SITES_FEWEST), SITES_MOST)
     return Chart(across, along, lower, upper, count)
 
 
 @dataclass(frozen=True, eq=False)
 class TouchMap:
-    """A square of MAP_SIDE x MAP_SIDE sites over the middle of a chart: the same size for every organ.
+    """Square of MAP_SIDE x MAP_SIDE sites over the middle of a chart, the same size for all organs.
 
     Fields:
         extent: of the chart [m]                                                        (2,)
-        cell: distance between neighbouring sites [m], MAP_CELL tip radii where they span the chart
-        pressable: whether a site may be pressed, row by row along the chart's second axis  (MAP_SIDE**2,)
+        cell: distance between neighbouring sites [m], MAP_CELL tip radii if they span the chart
+        pressable: True for pressable sites, row by row along the chart's second axis   (MAP_SIDE**2,)
     """
 
     extent: FloatArray
@@ -116,7 +116,7 @@ class TouchMap:
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
-        """Coordinates of its columns and rows, lengths along the chart's sides [m], (MAP_SIDE,) each.
+        """Coordinates of columns and rows, lengths along the chart's sides [m], (MAP_SIDE,) each.
 
         A column or row up to half a cell beyond the chart lies on its border.
         """
@@ -141,7 +141,7 @@ class TouchMap:
 
     @cached_property
     def rows_and_columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Numbers of the rows and of the columns that have a pressable site, ascending."""
+        """Numbers of the rows and of the columns with a pressable site, ascending."""
         face = self.pressable.reshape(MAP_SIDE, MAP_SIDE)
         return np.flatnonzero(face.any(axis=1)), np.flatnonzero(face.any(axis=0))
 
@@ -161,7 +161,7 @@ def _onto(values: FloatArray, length: float, reach: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """A place that may be pressed.
+    """Pressable place.
 
     Fields:
         place: on the chart                                     (2,)
@@ -189,42 +189,42 @@ class ChartedFace:
 
     @property
     def tip_radius(self) -> float:
-        """Radius of the tip that presses it [m]."""
+        """Radius of the pressing tip [m]."""
         return self.anatomy.scene.instrument.tip_radius
 
     def site(self, place: ArrayLike) -> Site:
-        """The site at a place of the chart (2,); the grid's nearest one if that may not be pressed.
+        """Site at a place of the chart (2,), or the grid's nearest site if the place is not pressable.
 
-        A place may not be pressed beyond the face, nearer to its rim than its margin, over too thin tissue, and where a
-        ligament or another support covers the face (`Anatomy.is_covered`).
+        A place is not pressable beyond the face, nearer to its rim than its margin, over too thin tissue, and under a
+        ligament or another support (`Anatomy.is_covered`).
         """
-        asked = np.asarray(place, dtype=np.float64)
-        found = self._found(asked)
-        if found is not None:
-            return Site(asked, *found, moved=0.0)
+        target = np.asarray(place, dtype=np.float64)
+        surface = self._pressable(target)
+        if surface is not None:
+            return Site(target, *surface, moved=0.0)
         places, points, normals = self._allowed
-        distance = norm(0.5 * (places - asked) * self.chart.extent, axis=1)
+        distance = norm(0.5 * (places - target) * self.chart.extent, axis=1)
         best = int(np.argmin(distance))
         return Site(places[best], points[best], normals[best], float(distance[best]))
 
     def grid_sites(self) -> list[Site]:
-        """The sites of the chart's grid, each moved to one that may be pressed."""
+        """Sites of the chart's grid, each moved to a pressable place."""
         return [self.site(place) for place in self.chart.sites]
 
-    def _found(self, place: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Surface point [m] and normal at a place of the chart (2,), (3,) each; None where it may not be pressed."""
+    def _pressable(self, place: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Surface point [m] and normal at a place of the chart (2,), (3,) each; None if it is not pressable."""
         u, v = self.chart.plane_point(place).tolist()
-        found = self.face.site(u, v, slack=ROUNDING)
-        return None if found is None or self.anatomy.is_covered(found[0]) else found
+        site = self.face.site(u, v, slack=ROUNDING)
+        return None if site is None or self.anatomy.is_covered(site[0]) else site
 
     @cached_property
     def _allowed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Places (n, 2), surface points [m] and normals (n, 3) of the grid's sites that may be pressed.
+        """Places (n, 2), surface points [m] and normals (n, 3) of the grid's pressable sites.
 
         Raises:
             ValueError: there is none.
         """
-        allowed = [(place, *site) for place in self.chart.sites if (site := self._found(place)) is not None]
+        allowed = [(place, *site) for place in self.chart.sites if (site := self._pressable(place)) is not None]
         if not allowed:
             raise ValueError(
                 "no site of the palpable face may be pressed: lower palpation.face_margin or thickness_smallest, or "
@@ -235,11 +235,11 @@ class ChartedFace:
 
     @cached_property
     def touch_map(self) -> TouchMap:
-        """The sites of observations."""
+        """Sites of observations."""
         extent = self.chart.extent
         plain = TouchMap(extent, self.cell, np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_))
         on_chart = (np.abs(plain.places) <= 1.0 + ROUNDING).all(axis=1)
-        allowed = [self._found(place) is not None for place in plain.places]
+        allowed = [self._pressable(place) is not None for place in plain.places]
         return TouchMap(extent, plain.cell, np.array(allowed) & on_chart)
 
     @property
@@ -294,22 +294,22 @@ class HealthyMap:
         return interpolated(self.grid, places)
 
 
-@lru_cache(maxsize=KEPT_MOST + 8)
+@lru_cache(maxsize=CACHED_MOST + 8)
 def charted_face(anatomy: Anatomy) -> ChartedFace:
-    """The palpable face of an anatomy with its chart; the same anatomy gives the same object."""
+    """Palpable face of an anatomy with its chart, cached."""
     return ChartedFace(anatomy, make_chart(anatomy.face, anatomy.scene.instrument.tip_radius))
 
 
 def healthy_map(scene: Scene) -> HealthyMap:
-    """The map of a scene, from beside its file or the cache on disk, or by pressing its healthy organ at every site.
+    """Healthy map of a scene, from beside its file or the cache on disk, or by pressing its healthy organ at each site.
 
-    `surgsim organ` writes it beside a patient's scene (`healthy_file`). One of another organ, instrument or version is
-    made anew in the same way, so is that of a family's template, and another scene without one is pressed as it is, all
+    `surgsim organ` writes it beside a patient's scene (`healthy_file`). A map of another organ, instrument or version
+    is renewed in the same way, as is that of a family's template; other scenes without a map are pressed as they are,
     with progress on standard error: 5 s of processor time for `phantom`, 90 s for `phantom_wide`. The cache is the
     folder named by SURGSIM_CACHE, else the user's cache folder; if it is not writable, each process computes the map.
 
     Raises:
-        ValueError: a press on healthy tissue that ended in a fault or measured no force (says where).
+        ValueError: a press on healthy tissue that ended in a fault or measured no force (states its place).
     """
     return healthy_map_of(load_anatomy(with_instrument(scene, "probe")))
 
@@ -320,9 +320,9 @@ def healthy_file(scene_file: Path) -> Path:
 
 
 def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
-    """Press the healthy organ of a scene at every site of the chart's grid, and write its map to an npz file.
+    """Press the healthy organ of a scene at each site of the chart's grid, and write its map to an npz file.
 
-    Organs advance in float32, twice as many side by side, and `quickened`.
+    Organs advance `quickened` in float32, with twice as many lanes.
 
     Raises:
         ValueError: as in `healthy_map`.
@@ -333,25 +333,25 @@ def write_healthy_map(scene: Scene, path: Path, progress: StepProgress) -> None:
 
 
 def quickened(anatomy: Anatomy, progress: StepProgress) -> Anatomy:
-    """The anatomy with up to MASS_SHARE of mass added, and the fewest substeps that this allows.
+    """Anatomy with up to MASS_SHARE of added mass, and the fewest substeps for it.
 
     Static forces do not depend on masses. On the liver of OpenHELP 2 in place of 6 substeps change no stiffness by more
     than 8e-4 of itself, on its left kidney 4 in place of 8 by 3e-4, on members of `liver_family` and `kidney_family` 2
     in place of 5 and 3 in place of 7 by 2.4e-4.
     """
     with progress.step("choosing the step of the healthy organ"):
-        return with_added_mass(with_substeps(anatomy, [anatomy.organ()]), lambda one: [one.organ()], MASS_SHARE)
+        return with_added_mass(with_substeps(anatomy, [anatomy.organ()]), lambda scaled: [scaled.organ()], MASS_SHARE)
 
 
 @lru_cache(maxsize=8)
 def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
-    """`healthy_map` of an anatomy that is loaded, with the scene's probe."""
+    """`healthy_map` of a loaded anatomy with the scene's probe."""
     scene, digest = anatomy.scene, map_digest(anatomy)
     beside = healthy_file(scene.folder / f"{scene.name}.toml")
     grid = _shipped(beside, digest)
     if grid is not None:
         return HealthyMap(grid)
-    # As members of a family, whose maps are made from this one.
+    # Like the members of its family: their maps start from this map.
     is_quick = scene.family is not None or beside.is_file()
     path = cache_folder() / f"healthy-{digest}{'-quick' * is_quick}.npy"
     if path.is_file():
@@ -363,7 +363,7 @@ def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
 
 
 def _shipped(path: Path, digest: str) -> FloatArray | None:
-    """The map beside a scene file; None if there is none, or it is of another organ or version."""
+    """Map beside a scene file; None if it is missing, or of another organ or version."""
     if not path.is_file():
         return None
     with np.load(path, allow_pickle=False) as archive:
@@ -373,26 +373,26 @@ def _shipped(path: Path, digest: str) -> FloatArray | None:
 def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64) -> FloatArray:
     """Press the healthy organ at each site of the chart's grid; stiffness [N/m], shape (m, m).
 
-    A coarser grid would alias the mesh, which changes the force by some 3 % within a cell, into a slope of the organ.
+    A coarser grid would alias the mesh, with 3 % changes of force within a cell, into a slope of the organ.
     """
     charted = charted_face(anatomy)
-    every = charted.grid_sites()
-    # Places that may not be pressed are moved to others of the grid.
-    sites = {site.place.tobytes(): site for site in every}
+    grid = charted.grid_sites()
+    # Unpressable places are moved to others of the grid.
+    sites = {site.place.tobytes(): site for site in grid}
     stiffness = press_sites(anatomy, list(sites.values()), progress, dtype)
-    found = dict(zip(sites, stiffness.tolist(), strict=True))
-    return np.array([found[site.place.tobytes()] for site in every]).reshape(charted.chart.side_count, -1)
+    values = dict(zip(sites, stiffness.tolist(), strict=True))
+    return np.array([values[site.place.tobytes()] for site in grid]).reshape(charted.chart.side_count, -1)
 
 
 def press_sites(
     anatomy: Anatomy, sites: Sequence[Site], progress: StepProgress, dtype: type = np.float64, name: str = ""
 ) -> FloatArray:
-    """Stiffness of presses on the healthy organ of an anatomy at some sites [N/m], (n_site,); organs side by side.
+    """Stiffness of presses on the healthy organ of an anatomy at sites [N/m], (n_site,), in lanes.
 
-    The progress names the organ by `name` too.
+    The progress shows `name`.
 
     Raises:
-        ValueError: a press that ended in a fault or measured no force (says where).
+        ValueError: a press that ended in a fault or measured no force (states its place).
     """
     phases, lanes = press_phases(anatomy.scene), LANES[dtype]
     batches = [sites[first : first + lanes] for first in range(0, len(sites), lanes)]
@@ -402,10 +402,11 @@ def press_sites(
 
     def press(own: LaneGroup, number: int) -> list[float]:
         batch = batches[number]
-        presses = [SitePress(one, site.point, site.normal) for one, site in zip(own.simulations, batch, strict=False)]
-        press_in_lanes(own, [*presses, *[None] * (lanes - len(presses))], phases)
+        pairs = zip(own.simulations, batch, strict=False)
+        presses = [SitePress(simulation, site.point, site.normal) for simulation, site in pairs]
+        press_in_lanes(own, presses, phases)
         advance(len(batch))
-        return [_stiffness(anatomy, one) for one in presses]
+        return [_stiffness(anatomy, press) for press in presses]
 
     with progress.step(f"pressing the healthy organ {name}".strip(), len(sites)) as advance:
         stiffness = in_threads(group, press, len(batches))
@@ -425,26 +426,26 @@ def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
 
 
 def map_digest(anatomy: Anatomy) -> str:
-    """Hash of what determines the map: the scene without its lesions, the instrument's file, the physics' version."""
+    """Hash of a map's inputs: the scene without its lesions, the instrument's file, the physics' version."""
     scene = anatomy.scene
     parts = (
         *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
         *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports),
         tuple(region for region in scene.regions if not region.lesion),
-        tuple(one for one in scene.anchors if one.is_elastic),
+        tuple(anchor for anchor in scene.anchors if anchor.is_elastic),
     )
     instrument = (scenes_folder() / "instruments" / scene.instrument.model).read_bytes()
     return content_digest(anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors, parts, instrument, PHYSICS_VERSION)
 
 
 def cache_folder() -> Path:
-    """The cache's folder."""
-    named = os.environ.get(FOLDER_VARIABLE)
-    return Path(named or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim")
+    """Folder of the cache."""
+    folder = os.environ.get(FOLDER_VARIABLE)
+    return Path(folder or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "surgsim")
 
 
 def keep_map(path: Path, grid: FloatArray) -> None:
-    """Write the map atomically; a folder that is not writable is ignored."""
+    """Write a map atomically; a read-only folder is ignored."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:

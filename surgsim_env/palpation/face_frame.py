@@ -1,4 +1,4 @@
-"""The frame of a palpable face: where a tip is on an organ whose surface is registered, whatever its size and pose."""
+"""Frame of a palpable face: tip positions on a registered organ, independent of its size and pose."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ from surgsim_env.palpation.chart import ChartedFace
 
 @dataclass(frozen=True, eq=False)
 class FaceFrame:
-    """Axes along the sides of a face's chart and against the approach, from above the middle of the chart.
+    """Axes along the sides of a face's chart and against the approach, with the origin above the chart's middle.
 
     Fields:
-        axes: unit vectors, one a row: the chart's first and second axis, and outward     (3, 3)
+        axes: unit vectors as rows: the chart's first and second axis, and outward        (3, 3)
         origin: the middle of the chart, as high as the face's highest point [m]          (3,)
     """
 
@@ -24,20 +24,20 @@ class FaceFrame:
 
     @classmethod
     def of(cls, charted: ChartedFace) -> "FaceFrame":
-        """The frame of a face."""
+        """Frame of a face."""
         chart, outward = charted.chart, -charted.face.approach
         axes = np.stack([chart.across, chart.along, outward])
         top = float(matmul(charted.face.points[charted.face.triangles], outward).max())
         return cls(axes, matmul(np.append(chart.plane_point(np.zeros(2)), top), axes))
 
     def vector(self, world: ArrayLike) -> FloatArray:
-        """A vector of the world (..., 3) on these axes."""
+        """Vector of the world (..., 3) in this frame."""
         return matmul(np.asarray(world, dtype=np.float64), self.axes.T)
 
     def point(self, world: ArrayLike) -> FloatArray:
-        """A point of the world [m] (..., 3) in this frame."""
+        """Point of the world [m] (..., 3) in this frame."""
         return self.vector(np.asarray(world, dtype=np.float64) - self.origin)
 
     def in_world(self, vector: ArrayLike) -> FloatArray:
-        """A vector on these axes (..., 3) as the world has it."""
+        """Vector of this frame (..., 3) in the world."""
         return matmul(np.asarray(vector, dtype=np.float64), self.axes)

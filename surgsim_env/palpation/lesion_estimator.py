@@ -1,4 +1,4 @@
-"""From presses on a chart to lesions: the Gaussian process of the contrast, and the one estimator of the benchmark."""
+"""Lesions estimated from presses on a chart: the Gaussian process of the contrast, and the benchmark's estimator."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.arithmetic import exp, matmul, solve
 from msdm_core.mesh.tet_mesh import FloatArray
 
-# The numbers below hold for lesions of 8 mm, the mean of those that `phantom` hides; lengths scale with the lesions'
-# radius, as the bell curves of their contrast do. They were chosen on organs that no evaluation uses, for the smallest
+# The numbers below hold for lesions of 8 mm, the mean of those in `phantom`; lengths scale with the lesions'
+# radius, as the bell curves of their contrast do. They were chosen on organs outside all evaluations, for the smallest
 # mean error over random presses (docs/palpation.md).
 REFERENCE_LESION_RADIUS = 0.008
-# Prior of the background's log contrast, one number for the organ: moduli of +-30 % and a capsule.
+# Prior standard deviation of the background's log contrast, one number for the organ: moduli of +-30 % and a capsule.
 BACKGROUND_SPREAD = 0.25
-# Prior of the excess that lesions add: standard deviation, and correlation length [m]. A press over a lesion sees a
+# Prior of the lesions' excess: standard deviation, and correlation length [m]. A press over a lesion measures a
 # bell curve of spread s = 7 mm, and a sum of such curves at random places has the correlation length sqrt(2) s.
 EXCESS_SPREAD = 0.225
 EXCESS_LENGTH = 0.010
-# Deviation of healthy presses that the sensor's noise does not explain: a capsule that the map lacks, the mesh.
+# Deviation of healthy presses beside the sensor's noise: a capsule absent from the map, the mesh.
 MODEL_SPREAD = 0.05
-# Deviation of healthy presses about the map of a curved organ: capsules and moduli that the map lacks show where the
-# tissue is thinner, and a member's map is off. On members of the training split of `liver_family` 0.009 to 0.032; more
-# costs nothing there, less adds false lesions (docs/palpation.md). On blocks, whose faces are flat, 0.007 to 0.016,
-# which EXCESS_LEAST covers.
+# Deviation of healthy presses about the map of a curved organ: capsules and moduli absent from the map show where the
+# tissue is thinner, and a member's map has errors. On the training split of `liver_family` 0.009 to 0.032; more
+# costs nothing there, less adds false lesions (docs/palpation.md). On blocks, with flat faces, 0.007 to 0.016,
+# within EXCESS_LEAST.
 ORGAN_MAP_SPREAD = 0.035
 # A lesion is a maximum of the excess above the first of these plus the second times the sensor's noise plus the third
 # times the map's deviation,
@@ -33,7 +33,7 @@ EXCESS_LEAST, EXCESS_LEAST_NOISE, EXCESS_LEAST_MAP = 0.07, 0.75, 2.0
 DISTANCE_LEAST = 0.012
 # placed at the centroid of the excess within this [m] of it,
 CENTROID_RADIUS = 0.009
-# and its outline is where the excess is above this share of it.
+# with an outline where the excess is above this share of its maximum.
 OUTLINE_SHARE = 0.6
 LESIONS_MOST = 3
 # Distance between the points of the excess map [m].
@@ -44,8 +44,8 @@ MAP_SPACING = 0.002
 class ContrastProcess:
     """Gaussian process regression with fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25 and 2.26).
 
-    log contrast at x = b + e(x) + noise, b ~ N(0, sb^2), e ~ GP(0, se^2 exp(-|x - x'|^2 / (2 l^2))): b is what all
-    sites share (modulus, capsule, the sensor's bias), e the excess over it.
+    log contrast at x = b + e(x) + noise, b ~ N(0, sb^2), e ~ GP(0, se^2 exp(-|x - x'|^2 / (2 l^2))): b is common to all
+    sites (modulus, capsule, the sensor's bias), e the excess over it.
 
     Args:
         axes: coordinates of a grid's columns and rows along the chart's sides [m], shapes (g0,) and (g1,)
@@ -88,12 +88,12 @@ class ContrastProcess:
         return along, across
 
     def excess_covariance(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Of the excess at places [m] (n, 2) and (m, 2): shape (n, m)."""
+        """Covariance of the excess at places [m] (n, 2) and (m, 2), shape (n, m)."""
         columns, rows = (self._correlation(first[:, i], second[:, i]) for i in range(2))
         return EXCESS_SPREAD * EXCESS_SPREAD * (columns * rows)
 
     def _covariance(self, places: FloatArray) -> FloatArray:
-        """Of the presses' log contrasts, (n, n)."""
+        """Covariance of the presses' log contrasts, (n, n)."""
         covariance = self.excess_covariance(places, places) + BACKGROUND_SPREAD * BACKGROUND_SPREAD
         covariance.flat[:: len(places) + 1] += self.noise_variance
         return covariance
@@ -105,11 +105,11 @@ class ContrastProcess:
 def contrast_process(
     axes: tuple[FloatArray, FloatArray], *, lesion_radius: float, noise: float, length_share: float = 1.0
 ) -> ContrastProcess:
-    """The process for lesions of a radius [m] and a sensor's standard deviation of one log contrast.
+    """Process for lesions of a radius [m] and a sensor's standard deviation of one log contrast.
 
     Args:
         axes: see `ContrastProcess`.
-        lesion_radius: mean radius of the lesions that are looked for [m].
+        lesion_radius: mean radius of the lesions [m].
         noise: standard deviation of one log contrast by the force sensor.
         length_share: factor on the correlation length.
     """
@@ -125,8 +125,8 @@ class LesionEstimate:
         points: places of the lesions on the chart [m], the strongest first                             (k, 2)
         strength: largest excess of the log contrast over each                                          (k,)
         background: log contrast of the tissue around them
-        excess: what lesions add to the log contrast, at the map's points: row along the second axis    (g1, g0)
-        outline: which of the map's points lie over a lesion                                            (g1, g0)
+        excess: of the log contrast by lesions, at the map's points, rows along the second axis         (g1, g0)
+        outline: True for the map's points over a lesion                                                (g1, g0)
         axes: the map's coordinates along the chart's first and second axis [m]                         (g0,), (g1,)
     """
 
@@ -142,8 +142,8 @@ class LesionEstimator:
     """Lesions as the maxima of the posterior mean excess of a Gaussian process (`ContrastProcess`).
 
     Args:
-        extent: of the chart, whose coordinates run from 0 to it [m], shape (2,).
-        lesion_radius: mean radius of the lesions that are looked for [m]; the model's lengths scale with it.
+        extent: of the chart, with coordinates from 0 on [m], shape (2,).
+        lesion_radius: mean radius of the lesions [m]; the model's lengths scale with it.
         noise: standard deviation of one log contrast by the sensor: its noise over the force of a healthy press.
         map_spread: standard deviation of the log contrast of healthy presses about the map, 0 on a block.
     """
@@ -160,7 +160,7 @@ class LesionEstimator:
         self.process = contrast_process(self.axes, lesion_radius=lesion_radius, noise=noise)
 
     def estimate(self, places: ArrayLike, log_contrast: ArrayLike) -> LesionEstimate:
-        """The lesions that presses indicate; without a press there are none.
+        """Estimate lesions from presses; none without a press.
 
         Args:
             places: of the presses on the chart [m], shape (n, 2).
@@ -185,18 +185,18 @@ class LesionEstimator:
         return points[:LESIONS_MOST], excess[rows, columns][chosen[:LESIONS_MOST]]
 
     def _squared_distance(self, point: FloatArray) -> FloatArray:
-        """From each of the map's points to a point [m^2], shape (g1, g0)."""
+        """Squared distance of the map's points from a point [m^2], shape (g1, g0)."""
         return np.square(self.axes[1][:, None] - point[1]) + np.square(self.axes[0] - point[0])
 
     def _centroid(self, excess: FloatArray, point: FloatArray) -> FloatArray:
-        """Centroid [m] of the positive excess around a maximum: a grid's point would be half a spacing off."""
+        """Centroid [m] of the positive excess around a maximum, finer than the grid's spacing."""
         near = self._squared_distance(point) <= (CENTROID_RADIUS * self.scale) * (CENTROID_RADIUS * self.scale)
         weight = np.where(near, np.maximum(excess, 0.0), 0.0)
         total = weight.sum()
         return np.array([matmul(weight.sum(axis=0), self.axes[0]), matmul(weight.sum(axis=1), self.axes[1])]) / total
 
     def _outline(self, excess: FloatArray, points: FloatArray, strength: FloatArray) -> NDArray[np.bool_]:
-        """Which of the map's points have more than a share of the excess of the lesion that they are nearest to."""
+        """True for the map's points with more than OUTLINE_SHARE of the nearest lesion's excess."""
         if len(points) == 0:
             return np.zeros(excess.shape, dtype=bool)
         nearest = np.argmin([self._squared_distance(point) for point in points], axis=0)
@@ -210,9 +210,9 @@ def strongest_apart(
 
     Args:
         height: of the peaks, shape (n,).
-        peaks: where they are [m], shape (n, d).
+        peaks: their positions [m], shape (n, d).
         distance_least: [m].
-        place: from a peak's index to the point (d,) that later peaks must keep away from; by default the peak itself.
+        place: maps a peak's index to the point (d,) to keep away from; by default the peak itself.
 
     Returns:
         Indices of the chosen peaks, the highest first, and their places, shape (k, d).
@@ -228,7 +228,7 @@ def strongest_apart(
 
 
 def _local_maxima(values: FloatArray, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of values above `least` that none of the eight neighbours exceeds; the border counts."""
+    """Rows and columns of values above `least` and not below their eight neighbours, border included."""
     padded = np.full((values.shape[0] + 2, values.shape[1] + 2), -np.inf)
     padded[1:-1, 1:-1] = values
     # The largest of three rows, then of three columns.

@@ -1,9 +1,9 @@
-"""The healthy map of a member of a family, from that of its template and few presses of its own.
+"""Healthy map of a member of a family, from that of its template and few presses of its own.
 
-What a mesh adds to the stiffness of a press varies from node to node, and members have the template's tets: at the
-same place of the face the ratio r of both stiffnesses varies as slowly as the deformation does. A Gaussian process with
-fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25) continues log r from PRESS_COUNT sites, far from each other,
-to all.
+The mesh's part of a press's stiffness varies from node to node, and members have the template's tets: at the
+same place of the face the ratio r of both stiffnesses varies as slowly as the deformation. A Gaussian process with
+fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25) interpolates log r from PRESS_COUNT sites, far from each
+other, to all.
 """
 
 from functools import lru_cache
@@ -32,25 +32,25 @@ from surgsim_env.scene.model import Scene
 from surgsim_env.scene.motions import STILL, with_motion
 from surgsim_env.step_progress import StepProgress
 
-# Sites that are pressed, six times as many as float32 has lanes. On the 16 members of the validation split of
+# Pressed sites, six times as many as float32 has lanes. On the 16 members of the validation split of
 # `liver_family`, pressed at every site, log k is then off by 0.017 (standard deviation) and by at most 0.15, the most
 # beside the falciform ligament and at the rim.
 PRESS_COUNT = 96
 # Standard deviations of log r about its mean, each with its correlation length over the longer half side of the chart:
-# the smooth deformation, and what it makes of edges and ligaments. The deviation of one press, by stretched cells.
+# the smooth deformation, and its effect on edges and ligaments. Standard deviation of one press, by stretched cells.
 RATIO_TERMS, PRESS_SPREAD = ((0.15, 0.5), (0.05, 0.08)), 0.015
-# Members whose maps are kept in memory, 5 kB each.
+# Number of members' maps in memory, 5 kB each.
 MAPS_MOST = 1000
 
 
 def still_template(scene: Scene) -> Anatomy:
-    """The anatomy whose healthy map belongs to a scene: with the probe, and without motion."""
+    """Anatomy of a scene for its healthy map: with the probe, and without motion."""
     return load_anatomy(with_instrument(with_motion(scene, STILL), "probe"))
 
 
 @lru_cache(maxsize=MAPS_MOST)
 def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
-    """The healthy map of a member of a family, from the cache on disk (`chart.healthy_map`) or by pressing it.
+    """Healthy map of a member of a family, from the cache on disk (`chart.healthy_map`) or by presses.
 
     Args:
         template: `still_template` of the family's scene.
@@ -71,16 +71,16 @@ def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
 
 
 def _corrected(base: HealthyMap, member: Anatomy, template: Anatomy, progress: StepProgress) -> FloatArray:
-    """The map of the template times the ratio that presses of the member show; stiffness [N/m], (m, m)."""
+    """Map of the template times the ratio measured by presses on the member; stiffness [N/m], (m, m)."""
     charted, own = charted_face(member), charted_face(template)
-    every = charted.grid_sites()
-    places = np.array([own.chart.place(member.face.carried(site.point, template.face)) for site in every])
+    sites = charted.grid_sites()
+    places = np.array([own.chart.place(member.face.carried(site.point, template.face)) for site in sites])
     expected = base.stiffness(np.clip(places, -1.0, 1.0))
-    spread = far_apart(charted, every)
+    spread = far_apart(charted, sites)
     quick = quickened(member, progress)
-    pressed = press_sites(quick, [every[index] for index in spread], progress, np.float32, str(member.member))
-    log_ratio = log(pressed / expected[spread])
-    points = np.array([site.place for site in every]) * charted.chart.extent / charted.chart.extent.max()
+    stiffness = press_sites(quick, [sites[index] for index in spread], progress, np.float32, str(member.member))
+    log_ratio = log(stiffness / expected[spread])
+    points = np.array([site.place for site in sites]) * charted.chart.extent / charted.chart.extent.max()
     mean = float(log_ratio.mean())
     weights = solve(
         _covariance(points[spread], points[spread]) + PRESS_SPREAD * PRESS_SPREAD * np.eye(len(spread)),
@@ -90,16 +90,16 @@ def _corrected(base: HealthyMap, member: Anatomy, template: Anatomy, progress: S
     return (expected * ratio).reshape(charted.chart.side_count, -1)
 
 
-def _covariance(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Of log r about its mean between points (n, 2) and (m, 2), in longer half sides of the chart, shape (n, m)."""
-    square = np.square(one[:, None] - other).sum(axis=2)
+def _covariance(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Covariance of log r between points (n, 2) and (m, 2), in longer half sides of the chart, shape (n, m)."""
+    square = np.square(first[:, None] - second).sum(axis=2)
     return np.sum(
         [spread * spread * exp(-square / (2.0 * (length * length))) for spread, length in RATIO_TERMS], axis=0
     )
 
 
 def far_apart(charted: ChartedFace, sites: list[Site]) -> list[int]:
-    """Indices of at most PRESS_COUNT different sites, each as far as possible from those before, from the middle on."""
+    """Indices of at most PRESS_COUNT different sites, from the middle on each as far as possible from those before."""
     places = np.array([site.place for site in sites]) * charted.chart.extent
     chosen, distance = [], norm(places, axis=1)
     index = int(np.argmin(distance))

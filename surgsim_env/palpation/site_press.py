@@ -1,4 +1,4 @@
-"""Presses along the surface normal: a plan of control steps that one simulation, lanes or many threads execute."""
+"""Presses along the surface normal in phases, executed by one simulation, in lanes or in threads."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -18,13 +18,13 @@ from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import Limits, Scene
 
-# Speed of the tip on the way in [m/s], rest at depth [s], and the end of the rest over which force is averaged [s].
+# Speed of the tip inward [m/s], rest at depth [s], and averaging time of force at the end of the rest [s].
 PRESS_SPEED = 0.04
 HOLD_TIME = 0.10
 AVERAGE_TIME = 0.04
-# A tip that follows a surface is commanded this often [s].
+# Interval between commands of a tip on a moving surface [s].
 FOLLOWING_TIME = 0.010
-# Interval of the readings that `press_phases` averages [s]; `recorded_phases` reads every haptic step.
+# Interval of the averaged readings of `press_phases` [s]; `recorded_phases` reads in each haptic step.
 READING_TIME = 0.010
 
 Tool = TypeVar("Tool")
@@ -33,14 +33,14 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class PressPhase:
-    """A part of a press, executed in one call.
+    """Part of a press, executed in one call.
 
     Args:
         count: haptic steps.
-        inward: the tip moves inward; else it rests.
-        force_limit: contact force [N] that ends the phase with the haptic step that exceeds it.
-        read: force and depth are read at its end.
-        command: haptic steps until the instrument's velocity is commanded again, from the phase's start; 0 continues
+        inward: True for motion inward, False for rest.
+        force_limit: contact force [N] beyond which the phase ends.
+        read: True for a reading of force and depth at its end.
+        command: haptic steps from the phase's start until the next command of the instrument's velocity; 0 continues
             the previous command.
     """
 
@@ -59,10 +59,10 @@ class PressResult:
         force: of the tissue on the tip, mean of the readings at the end of the hold [N]           (3,)
         depth: of the tip below the rest surface (carried by its ground) along the normal, mean of the same readings [m]
         force_peak: largest contact force of any haptic step [N]
-        stopped: the way in ended by force before it ended by depth
+        stopped: True if force ended the motion inward before depth did
         fault: fault of the simulation, or an empty string
         duration: simulated time [s]
-        workspace_limited: the instrument could not follow its command in some phase
+        workspace_limited: True if the instrument was stopped at a limit in a phase
     """
 
     force: FloatArray
@@ -76,7 +76,7 @@ class PressResult:
 
 @dataclass(frozen=True, eq=False)
 class Press:
-    """A press recorded at every haptic step.
+    """Press recorded in each haptic step.
 
     Fields:
         site, normal: surface point [m] and unit outward normal at rest                            (3,)
@@ -86,9 +86,9 @@ class Press:
         curve: depth [m] and force along the normal [N] at each haptic step of contact             (n, 2)
         volume_ratio_smallest: of any tet at any substep
         load: largest contact pressure and strain of the tissue at the end
-        end: why it ended early (the hard limit or a fault); empty for a complete press
+        end: reason of an early end (the hard limit or a fault); empty for a complete press
         duration: simulated time [s]
-        far_travel: largest displacement at the end of a node in the half of the organ that is farther from the site [m]
+        far_travel: largest displacement at the end of a node in the organ's half farther from the site [m]
     """
 
     site: FloatArray
@@ -105,15 +105,15 @@ class Press:
 
 
 def stop_force(limits: Limits) -> float:
-    """Contact force [N] that ends the way in of `press_phases`: half way from the soft to the hard limit.
+    """Contact force [N] at the end of `press_phases`' motion inward: half way from the soft to the hard limit.
 
-    A press executed as commanded thus cannot exceed the hard limit, however stiff the tissue below.
+    A press executed as commanded then stays below the hard limit on tissue of any stiffness.
     """
     return 0.5 * (limits.soft_force + limits.hard_force)
 
 
 def press_phases(scene: Scene) -> tuple[PressPhase, ...]:
-    """A press in few control steps: in to the scene's depth or `stop_force`, hold, readings READING_TIME apart."""
+    """Press in few control steps: inward to the scene's depth or `stop_force`, hold, readings READING_TIME apart."""
     inward, hold, longest = _step_counts(scene)
     apart, readings = max(1, round(READING_TIME / scene.timing.haptic_step)), round(AVERAGE_TIME / READING_TIME)
     hard, stop = scene.limits.hard_force, stop_force(scene.limits)
@@ -125,7 +125,7 @@ def press_phases(scene: Scene) -> tuple[PressPhase, ...]:
 
 
 def recorded_phases(scene: Scene) -> tuple[PressPhase, ...]:
-    """A press that is read at every haptic step and that only the hard limit ends."""
+    """Press with a reading in each haptic step, ended early by the hard limit alone."""
     inward, hold, longest = _step_counts(scene)
     return tuple(
         PressPhase(1, step < inward, scene.limits.hard_force, True, longest * (step == inward or step % longest == 0))
@@ -134,7 +134,7 @@ def recorded_phases(scene: Scene) -> tuple[PressPhase, ...]:
 
 
 def _step_counts(scene: Scene) -> tuple[int, int, int]:
-    """Haptic steps of the way in, of the hold, and at most of one command."""
+    """Haptic steps of the motion inward and of the hold, and the largest number for a command."""
     dt = scene.timing.haptic_step
     inward = round((scene.palpation.clearance + scene.palpation.press_depth) / (PRESS_SPEED * dt))
     longest = max(1, round(FOLLOWING_TIME / dt)) if scene.motions else scene.timing.haptic_steps_per_control
@@ -147,9 +147,9 @@ def _parts(count: int, most: int) -> list[int]:
 
 
 class SitePress:
-    """A press in progress: for each phase `begin`, a control step of its simulation, `end`.
+    """Press in progress: for each phase `begin`, a control step of its simulation, `end`.
 
-    `readings` holds force [N] (3,) and depth [m] of each phase that is read, and of one that exceeds the hard limit.
+    `readings` holds force [N] (3,) and depth [m] of each phase with a reading, and of a phase beyond the hard limit.
     """
 
     def __init__(
@@ -167,9 +167,9 @@ class SitePress:
             simulation: of the organ and the tool.
             point: [m], shape (3,).
             normal: shape (3,).
-            elapsed: time of the organ's motions since they were drawn [s].
-            tracks: the tip goes with the surface that moves, as a camera's markers show it (`SurfaceTracker`); else it
-                presses where the point is at rest.
+            elapsed: time of the organ's motions since their draw [s].
+            tracks: True for a tip on the moving surface, by a camera's markers (`SurfaceTracker`), False for a press at
+                the resting point.
         """
         scene = simulation.anatomy.scene
         self.simulation, self.point, self.normal = simulation, point, normal
@@ -182,14 +182,14 @@ class SitePress:
         start = point + simulation.ground_shift(point, elapsed) if moves else point
         simulation.restart(start + normal * (self._radius + scene.palpation.clearance), elapsed=elapsed)
         self._tracker = SurfaceTracker(simulation, np.unique(simulation.anatomy.face.triangles)) if moves else None
-        # How far the tip went with the surface [m], until when [s] and at which velocity it goes on [m/s].
+        # Displacement of the tip with the surface [m], its time [s], and the velocity from then on [m/s].
         self._carried, self._carried_until, self._velocity = start - point, 0.0, np.zeros(3)
 
     def begin(self, phase: PressPhase) -> bool:
-        """Command the instrument for a phase; False where the press skips it: over, or stopped on the way in."""
+        """Command the instrument for a phase; False for a skipped phase: the press is over, or stopped inward."""
         if self._over or (phase.inward and self._stopped):
             return False
-        # A velocity holds for one control step: an arm's joint speeds are solved anew.
+        # A velocity is valid for one control step: an arm's joint speeds are solved anew.
         if phase.command:
             velocity = -PRESS_SPEED * self.normal if phase.inward else np.zeros(3)
             duration = phase.command * self.simulation.haptic_dt
@@ -197,7 +197,7 @@ class SitePress:
         return True
 
     def _surface_velocity(self, duration: float) -> FloatArray:
-        """The velocity with which the tip goes with the surface for a duration [s] [m/s], (3,)."""
+        """Velocity of the tip with the surface over a duration [s] [m/s], (3,)."""
         if self._tracker is None:
             return self._velocity
         now = self.simulation.time
@@ -208,8 +208,9 @@ class SitePress:
         self._velocity = (self._tracker.displacement(duration) - self._carried) / duration
         return self._velocity
 
-    def end(self, phase: PressPhase, force_peak: float) -> None:
-        """Record an executed phase and its largest contact force [N]."""
+    def end(self, phase: PressPhase) -> None:
+        """Record an executed phase."""
+        force_peak = self.simulation.force_peak
         self.force_peak = max(self.force_peak, force_peak)
         self._limited |= self.simulation.instrument.workspace_limited
         if self.simulation.fault or not self.simulation.end_control_step():
@@ -223,7 +224,7 @@ class SitePress:
             self.readings.append((self.simulation.contact_force, float(below)))
 
     def result(self) -> PressResult:
-        """The outcome so far; after a fault force and depth are 0."""
+        """Outcome so far; after a fault force and depth are 0."""
         fault = self.simulation.fault
         readings = self.readings if not fault else [(np.zeros(3), 0.0)]
         return PressResult(
@@ -241,31 +242,29 @@ def press_alone(press: SitePress, phases: Sequence[PressPhase]) -> PressResult:
     """Execute a press with its simulation alone."""
     for phase in phases:
         if press.begin(phase):
-            press.end(phase, press.simulation.control_step(phase.count, phase.force_limit))
+            press.simulation.control_step(phase.count, phase.force_limit)
+            press.end(phase)
     return press.result()
 
 
-def press_in_lanes(group: LaneGroup, presses: Sequence[SitePress | None], phases: Sequence[PressPhase]) -> None:
-    """Execute one press with each simulation of a group side by side, None for none; `SitePress.result` has each."""
+def press_in_lanes(group: LaneGroup, presses: Sequence[SitePress], phases: Sequence[PressPhase]) -> None:
+    """Execute presses with simulations of a group in lanes; read `SitePress.result` after it."""
     for phase in phases:
-        moving = [press for press in presses if press is not None and press.begin(phase)]
-        if not moving:
-            continue
-        group.control_step(np.array([press in moving for press in presses]), phase.count, phase.force_limit)
+        if moving := [press for press in presses if press.begin(phase)]:
+            group.control_step([press.simulation for press in moving], phase.count, phase.force_limit)
         for press in moving:
-            # The group has advanced it: this only reports the largest force.
-            press.end(phase, press.simulation.control_step(phase.count, phase.force_limit))
+            press.end(phase)
 
 
 def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press:
     """Press the resting organ of a simulation once, along the inward normal, to its scene's depth or hard limit."""
     scene = simulation.anatomy.scene
-    pressed = SitePress(simulation, site, normal)
-    result = press_alone(pressed, recorded_phases(scene))
+    site_press = SitePress(simulation, site, normal)
+    result = press_alone(site_press, recorded_phases(scene))
     end = result.fault
-    if not end and pressed.force_peak > scene.limits.hard_force:
+    if not end and site_press.force_peak > scene.limits.hard_force:
         end = f"force limit {scene.limits.hard_force:g} N"
-    curve = np.array([(depth, matmul(force, normal)) for force, depth in pressed.readings]).reshape(-1, 2)
+    curve = np.array([(depth, matmul(force, normal)) for force, depth in site_press.readings]).reshape(-1, 2)
     # Without a reading before a fault depth and force are 0, as in `SitePress.result`.
     last = curve[-1 if end else -round(AVERAGE_TIME / simulation.haptic_dt) :] if len(curve) else np.zeros((1, 2))
     return Press(
@@ -284,7 +283,7 @@ def press(simulation: Simulation, site: FloatArray, normal: FloatArray) -> Press
 
 
 def _far_travel(simulation: Simulation, site: FloatArray) -> float:
-    """`Press.far_travel` of the present state [m]."""
+    """`Press.far_travel` of the current state [m]."""
     rest = simulation.anatomy.mesh.points
     distance = norm(rest - site, axis=1)
     far = distance >= np.median(distance)
@@ -300,33 +299,33 @@ def scan(
     *,
     progress: Callable[[], None] = lambda: None,
 ) -> list[Press]:
-    """Press each site of a resting organ, on all cores; presses are independent: the result does not depend on them.
+    """Press each site of a resting organ on all cores; presses are independent, so their number changes no result.
 
     Args:
         anatomy: the scene's organ.
-        organ_model: the organ that is pressed, with or without lesions.
+        organ_model: the pressed organ, with or without lesions.
         sites: surface points [m], shape (n_site, 3).
         normals: unit outward normals there, shape (n_site, 3).
         progress: called after each press.
     """
 
     def simulation() -> Simulation:
-        made = Simulation(anatomy)
-        made.reset(organ_model, sites[0] + normals[0] * 0.05)
-        return made
+        own = Simulation(anatomy)
+        own.reset(organ_model, sites[0] + normals[0] * 0.05)
+        return own
 
     def pressed(own: Simulation, index: int) -> Press:
-        done = press(own, sites[index], normals[index])
+        result = press(own, sites[index], normals[index])
         progress()
-        return done
+        return result
 
     return in_threads(simulation, pressed, len(sites))
 
 
 def in_threads(make: Callable[[], Tool], work: Callable[[Tool, int], Result], count: int) -> list[Result]:
-    """Results of `work` for all numbers below `count`, on all cores; each thread makes a tool of its own for it.
+    """Results of `work` for the numbers below `count`, on all cores; each thread makes a tool of its own for it.
 
-    An error, or Ctrl-C, cancels the calls that have not begun.
+    An error or Ctrl-C cancels the remaining calls.
     """
     own = threading.local()
 

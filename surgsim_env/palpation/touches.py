@@ -1,4 +1,4 @@
-"""Running records of touches on a chart: of single presses, and of a moving tip in a fixed size for observations."""
+"""Records of touches on a chart: of single presses, and of a moving tip in a fixed size for observations."""
 
 import copy
 import math
@@ -12,30 +12,30 @@ from numpy.typing import ArrayLike
 from msdm_core.arithmetic import log
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.palpation.bell_fit import BellFit, framed
+from surgsim_env.palpation.bell_fit import BellFit, framed, ratio
 from surgsim_env.palpation.chart import ChartedFace, HealthyMap, Site
 from surgsim_env.palpation.site_press import PressResult
 from surgsim_env.scene.model import PalpationSettings, Scene
 from surgsim_env.scene.palpable_surface import hertz_force
 
-# Speed of the tip between sites [m/s]; this travel is counted, not simulated.
+# Speed of the tip between sites [m/s]; its travel is counted, not simulated.
 TRAVEL_SPEED = 0.02
-# Log contrast is clipped to +- this; `Touch.cut` reports it.
+# Largest absolute log contrast; `Touch.cut` reports clipping.
 LOG_CONTRAST_BOUND = 2.0
 
 
 @dataclass(frozen=True)
 class Touch:
-    """The observable outcome of a press.
+    """Observable outcome of a press.
 
     Args:
         place: on the chart, each -1 to 1.
         moved: distance from the requested place [m].
         force: along the inward normal, through the sensor model [N].
         depth: of the tip [m].
-        log_contrast: log of stiffness over healthy stiffness there.
-        cut: the log contrast was clipped to its bound.
-        stopped: force ended the way in before depth did.
+        log_contrast: log of stiffness over healthy stiffness.
+        cut: True if the log contrast was clipped to its bound.
+        stopped: True if force ended the motion inward before depth did.
     """
 
     place: tuple[float, float]
@@ -48,17 +48,17 @@ class Touch:
 
     @property
     def stiffness(self) -> float:
-        """Force over depth [N/m]; 0 where the tip did not get below the surface."""
+        """Force over depth [N/m]; 0 for a tip above the surface."""
         return self.force / self.depth if self.depth > 0.0 else 0.0
 
 
 class SiteTouches:
-    """The touches of an episode.
+    """Touches of an episode.
 
     Fields:
-        touches: one a press, in their order
-        seconds, path_length: of the tip so far [s], [m], with the travel between sites, which is not simulated
-        map_shift: where the healthy map lies off the organ, along the chart's sides [m] (2,)
+        touches: of the presses, in their order
+        seconds, path_length: of the tip so far [s], [m], with the counted travel between sites
+        map_shift: offset of the healthy map from the organ along the chart's sides [m] (2,)
     """
 
     def __init__(self, charted: ChartedFace, healthy: HealthyMap, palpation: PalpationSettings) -> None:
@@ -75,13 +75,13 @@ class SiteTouches:
 
     @property
     def last(self) -> Touch:
-        """The last touch; zeros before the first one."""
+        """Last touch; zeros before the first."""
         return self.touches[-1] if self.touches else Touch((0.0, 0.0))
 
     def add(self, site: Site, result: PressResult, force: float) -> None:
         """Record a press at a site, with the sensor's reading of the force along the normal [N]."""
         healthy = float(self.healthy.stiffness(site.place + 2.0 * self.map_shift / self.charted.chart.extent))
-        # Bias and noise may reverse a small force, and an arm may not reach below the surface: the least contrast.
+        # The least contrast for a small force reversed by bias and noise, and for an arm stopped above the surface.
         contrast = force / (result.depth * healthy) if result.depth > 0.0 else 0.0
         log_contrast = float(log(contrast)) if contrast > 0.0 else -math.inf
         bounded = min(max(log_contrast, -LOG_CONTRAST_BOUND), LOG_CONTRAST_BOUND)
@@ -90,15 +90,15 @@ class SiteTouches:
         self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped))
         self._mark(self.touches[-1])
         start = site.point + site.normal * self.palpation.clearance
-        way = 0.0 if self._last_start is None else math.dist(start, self._last_start)
+        travel = 0.0 if self._last_start is None else math.dist(start, self._last_start)
         stroke = self.palpation.clearance + result.depth
-        self.path_length += way + 2.0 * stroke
-        self.seconds += result.duration + (way + stroke) / TRAVEL_SPEED
+        self.path_length += travel + 2.0 * stroke
+        self.seconds += result.duration + (travel + stroke) / TRAVEL_SPEED
         self._last_start = start
 
     @property
     def places(self) -> FloatArray:
-        """Places of the presses, lengths along the chart's sides [m], shape (n, 2)."""
+        """Places of the presses as lengths along the chart's sides [m], shape (n, 2)."""
         places = np.array([touch.place for touch in self.touches]).reshape(-1, 2)
         return 0.5 * (places + 1.0) * self.charted.chart.extent
 
@@ -108,9 +108,9 @@ class SiteTouches:
         return np.array([touch.log_contrast for touch in self.touches])
 
     def maps(self) -> FloatArray:
-        """Log contrast, and 1 where pressed, for each site of the touch map, shape (2, n_site).
+        """Log contrast, and 1 for pressed sites, of the touch map, shape (2, n_site).
 
-        A site that was pressed again has its latest contrast.
+        A site pressed again has its latest contrast.
         """
         return self._maps
 
@@ -119,7 +119,7 @@ class SiteTouches:
         self._maps[:, site] = touch.log_contrast, 1.0
 
     def get_state(self) -> dict[str, Any]:
-        """The record as a table for JSON."""
+        """Record as a table for JSON."""
         return {
             "touches": [asdict(touch) for touch in self.touches],
             "way": [self.seconds, self.path_length],
@@ -128,7 +128,7 @@ class SiteTouches:
         }
 
     def set_state(self, table: Mapping[str, Any]) -> None:
-        """Restore the record that `get_state` gave."""
+        """Restore a record from `get_state`."""
         self.clear()
         for touch in table["touches"]:
             self.touches.append(Touch(**{**touch, "place": tuple(touch["place"])}))
@@ -140,14 +140,14 @@ class SiteTouches:
 
 
 def felt_lesion_radius(scene: Scene) -> float:
-    """Mean radius of the lesions that a scene hides [m]; those smaller than the tip are felt as wide as the tip."""
+    """Mean felt radius of a scene's hidden lesions [m]; lesions smaller than the tip are felt as wide as the tip."""
     assert scene.lesion is not None
     return max(scene.instrument.tip_radius, 0.5 * (scene.lesion.radius[0] + scene.lesion.radius[1]))
 
 
 @dataclass(frozen=True)
 class Indenter:
-    """A ball on a soft half space: the model of a press on healthy tissue.
+    """Ball on a soft half space, the model of a press on healthy tissue.
 
     Args:
         radius: of the ball [m].
@@ -163,11 +163,11 @@ class Indenter:
 
 
 class TouchMemory:
-    """Contrast at each site of a touch map: force over Hertz's for nominal tissue, fitted to all readings there.
+    """Contrast at each site of a touch map: force over Hertz's for nominal tissue, fitted to the site's readings.
 
-    Readings f_i at depths with Hertz's forces h_i give the least-squares contrast sum(f_i h_i) / sum(h_i^2), so that
-    deep presses, which have the least relative noise, weigh most. Readings where no site may be pressed, and at less
-    than half the scene's press depth, are left out: |contrast| is at most the sensor's range over Hertz's force there
+    Readings f_i at depths with Hertz's forces h_i give the least-squares contrast sum(f_i h_i) / sum(h_i^2); deep
+    presses, with the least relative noise, weigh most. Readings off the pressable sites and at less than half the
+    scene's press depth are left out: |contrast| is at most the sensor's range over Hertz's force at that depth
     (`bound`).
     """
 
@@ -184,10 +184,10 @@ class TouchMemory:
         """Start with an empty record.
 
         Args:
-            charted: the face, whose touch map is recorded.
+            charted: the face with the touch map.
             indenter: model of the healthy press.
             press_depth: of the scene [m].
-            lesion_radius: mean radius of the lesions that are looked for, as the tip feels them [m].
+            lesion_radius: mean felt radius of the lesions [m].
             force_range: of the sensor, each axis [N].
             force_noise: of the sensor, standard deviation of a reading [N].
         """
@@ -200,18 +200,18 @@ class TouchMemory:
     def forget(self) -> None:
         """Begin an episode."""
         self.product, self.square = np.zeros((2, len(self.map.pressable)))
-        # Fitted when it is asked for after a reading.
+        # Fitted on demand after a reading.
         self._stiffest: FloatArray | None = None
 
     def restored(self, product: ArrayLike, square: ArrayLike) -> Self:
-        """A copy with other sums of the readings, (n_site,) each."""
+        """Copy with other sums of the readings, (n_site,) each."""
         other = copy.copy(self)
         other.product, other.square = np.array(product, dtype=np.float64), np.array(square, dtype=np.float64)
         other._stiffest = None
         return other
 
     def feel(self, place: FloatArray, depth: float, force: float) -> None:
-        """Add a reading of the force along the normal [N], at a place of the chart (2,) and a depth [m]."""
+        """Add a reading of the force along the normal [N] at a place of the chart (2,) and a depth [m]."""
         site = self.map.nearest(place)
         if site < 0 or not self.map.pressable[site] or depth < self.least_depth:
             return
@@ -222,13 +222,13 @@ class TouchMemory:
 
     @property
     def visited(self) -> FloatArray:
-        """1 where a site has a reading, else 0, shape (n_site,)."""
+        """1 for sites with a reading, else 0, shape (n_site,)."""
         return (self.square > 0.0).astype(np.float64)
 
     @property
     def contrast(self) -> FloatArray:
         """Contrast of each site, 0 without a reading, shape (n_site,)."""
-        return _ratio(self.product, self.square)
+        return ratio(self.product, self.square)
 
     def stiffest(self) -> FloatArray:
         """Place (2,) and contrast of the stiffest spot; zeros without a reading."""
@@ -241,13 +241,12 @@ class TouchMemory:
 def stiffest_spots(bell_fit: BellFit, product: FloatArray, square: FloatArray) -> FloatArray:
     """Place and contrast of the stiffest spot of n records (n, 3), from their sums of readings (n, n_site) each.
 
-    The place is the middle of the bell that fits the record best (`BellFit`); where no bell fits better than none, the
-    site of the largest contrast. The contrast is that of the nearest site, averaged with its eight neighbours. A record
-    without a reading gives zeros.
+    The place is the middle of the best bell (`BellFit`); if no bell improves the fit, the site of the largest contrast.
+    The contrast is that of the nearest site, averaged with its eight neighbours. A record without readings gives zeros.
     """
     sums = bell_fit.cropped(np.stack([product, square]))
     bell = bell_fit.best(*sums)
-    around = _ratio(*_with_neighbours(sums)).reshape(len(product), -1)
+    around = ratio(*_with_neighbours(sums)).reshape(len(product), -1)
     felt = sums[1].reshape(len(product), -1) > 0.0
     best = np.where(bell.site >= 0, bell.site, np.argmax(np.where(felt, around, -np.inf), axis=1))
     place = np.where((bell.site >= 0)[:, None], bell.place, bell_fit.places[best])
@@ -260,7 +259,3 @@ def _with_neighbours(values: FloatArray) -> FloatArray:
     larger = framed(values.reshape(-1, *values.shape[-2:]), 0.0)
     rows = larger[:, :-2] + larger[:, 1:-1] + larger[:, 2:]
     return (rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]).reshape(values.shape)
-
-
-def _ratio(product: FloatArray, square: FloatArray) -> FloatArray:
-    return np.divide(product, square, out=np.zeros_like(product), where=square > 0.0)

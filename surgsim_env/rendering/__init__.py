@@ -1,7 +1,7 @@
-"""Pictures of a simulation: colour, depth and labels of each pixel, off screen or in a window."""
+"""Pictures of a simulation: colour, depth and labels, off screen or in a window."""
 
 from surgsim_env.rendering import gl
-from surgsim_env.rendering.cameras import Camera, filling, scene_cameras
+from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.embedding import organ_surface
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.looks import LOOK_SPLITS, draw_look, find_look_ranges, look_generator
@@ -23,7 +23,6 @@ __all__ = [
     "cut_edges",
     "draw_look",
     "draw_still",
-    "filling",
     "find_look_ranges",
     "geom_colour",
     "gl",

@@ -10,16 +10,16 @@ from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import Endoscope
 from surgsim_env.scene.palpable_surface import tangent_axes
 
-# Share of the overview's picture that the organ fills, and how far above its middle the view is aimed, as a share of
+# Share of the overview's picture filled by the organ, and height of the aim above its middle, as a share of
 # half the height.
 OVERVIEW_FOV, OVERVIEW_SHARE, OVERVIEW_SHIFT = 32.0, 0.72, 0.2
 # The organ lies within this share of half that picture's height.
 EDGE = 0.96
 # Elevation and azimuth of the overview [degrees].
 OVERVIEW_HEIGHT, OVERVIEW_SIDE = 32.0, 28.0
-# Elevation of the side view [degrees], and how far above the organ's middle it is aimed, as for the overview.
+# Elevation of the side view [degrees], and height of its aim, as for the overview.
 SIDE_HEIGHT, SIDE_SHIFT = 10.0, 0.25
-# The endoscope looks at the palpable face at this angle [degrees], from as far as the face is wide within bounds [m].
+# Angle of the endoscope to the palpable face [degrees]; its distance is the face's width within bounds [m].
 ENDOSCOPE_FOV, ENDOSCOPE_TILT = 60.0, 38.0
 ENDOSCOPE_DISTANCES = (0.10, 0.20)
 
@@ -29,8 +29,8 @@ class Camera:
     """A pinhole camera.
 
     Fields:
-        position, target: where it is and what is in the middle of its picture [m]  (3,) each
-        up: unit vector that is upright in the picture                              (3,)
+        position, target: the pinhole, and the point in the middle of the picture [m] (3,) each
+        up: unit vector, upright in the picture                                     (3,)
         rotation: columns are the picture's right, its up and the way back          (3, 3)
         fov: vertical field of view [degrees]                                       scalar
     """
@@ -43,17 +43,17 @@ class Camera:
 
     @classmethod
     def looking(cls, position: FloatArray, target: FloatArray, up: FloatArray, fov: float) -> "Camera":
-        """A camera at a position that looks at a target [m], with `up` upright in the picture."""
+        """Camera at a position, aimed at a target [m], with `up` upright in the picture."""
         back = (position - target) / np.linalg.norm(position - target)
         right = cross(up, back)
         if np.linalg.norm(right) < 1e-6:
-            # It looks along `up`: any other upright direction will do.
+            # The view is along `up`: any other upright direction will do.
             right, _ = tangent_axes(back)
         right /= np.linalg.norm(right)
         return cls(position, target, up, np.column_stack([right, cross(back, right), back]), fov)
 
     def sees_above_level(self) -> bool:
-        """Whether some ray of its picture does not meet the drape, which lies below: background is seen there."""
+        """True if some ray of the picture passes above the drape, so that background is seen."""
         climb = math.degrees(math.asin(float(np.clip(-self.rotation[:, 2] @ self.up, -1.0, 1.0))))
         return climb + 0.5 * self.fov > -1.0
 
@@ -64,14 +64,14 @@ class Camera:
         return np.column_stack([0.5 * width - focal * x / z, 0.5 * height + focal * y / z]), -z
 
 
-def cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    """The cross product of two vectors (3,), in a tenth of numpy's time, which counts in small pictures."""
-    (a, b, c), (d, e, f) = one.tolist(), other.tolist()
+def cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Cross product of two vectors (3,); ten times as fast as numpy's."""
+    (a, b, c), (d, e, f) = first.tolist(), second.tolist()
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Camera]:
-    """The scene's cameras by name, those of `options.CAMERAS`, for pictures of an aspect (width over height)."""
+    """Cameras of a scene by their names in `options.CAMERAS`, for an aspect ratio (width over height)."""
     points = anatomy.mesh.points
     up = -anatomy.downward
     across, along = tangent_axes(anatomy.downward)
@@ -87,16 +87,16 @@ def scene_cameras(anatomy: Anatomy, aspect: float = 4.0 / 3.0) -> dict[str, Came
 
 
 def cut_direction(anatomy: Anatomy) -> FloatArray:
-    """The level unit direction towards the overview, the side from which an organ is cut open, shape (3,)."""
+    """Horizontal unit direction towards the overview camera, normal to the cut of a cut-open organ, shape (3,)."""
     across, along = tangent_axes(anatomy.downward)
     side = math.radians(OVERVIEW_SIDE)
     return across * math.sin(side) - along * math.cos(side)
 
 
 def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: float, shift: float) -> Camera:
-    """A camera in a direction that has all points in the middle OVERVIEW_SHARE of a picture.
+    """Camera in a direction with all points in the middle OVERVIEW_SHARE of the picture.
 
-    It looks above their middle by a share of the picture's height, which leaves room for an instrument.
+    The aim is above their middle by a share of the picture's height: room for an instrument.
     """
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     camera = Camera.looking(middle + direction, middle, up, OVERVIEW_FOV)
@@ -113,36 +113,19 @@ def _framing(points: FloatArray, direction: FloatArray, up: FloatArray, aspect: 
     return Camera.looking(target + distance * camera.rotation[:, 2], target, up, OVERVIEW_FOV)
 
 
-def filling(
-    points: FloatArray, direction: FloatArray, up: FloatArray, fov: float, aspect: float, share: float
-) -> Camera:
-    """The nearest camera in a direction that has all points [m] (n, 3) in the middle share of a picture.
-
-    With x a point's place across the view, z towards the camera, c and d the camera's, and t the share times the
-    tangent of half the angle of view, |x - c| <= t (d - z) for all points where t d is at least max(x + t z) - c and
-    max(t z - x) + c.
-    """
-    rotation = Camera.looking(direction, np.zeros(3), up, fov).rotation
-    seen = points @ rotation
-    room = share * math.tan(math.radians(0.5 * fov)) * np.array([aspect, 1.0])
-    high, low = ((sign * seen[:, :2] + room * seen[:, 2:]).max(axis=0) for sign in (1.0, -1.0))
-    position = rotation @ np.append(0.5 * (high - low), (0.5 * (high + low) / room).max())
-    return Camera.looking(position, position - rotation[:, 2], up, fov)
-
-
 def _raised(level: FloatArray, up: FloatArray, angle: float) -> FloatArray:
-    """A level unit direction raised towards up by an angle [degrees]."""
+    """Horizontal unit direction raised by an angle [degrees]."""
     return level * math.cos(math.radians(angle)) + up * math.sin(math.radians(angle))
 
 
 def placed_endoscope(anatomy: Anatomy, place: Endoscope) -> Camera:
-    """The upright camera of an endoscope whose pose the scene states."""
+    """Upright camera of an endoscope with a given pose."""
     up = -anatomy.downward
     return Camera.looking(np.asarray(place.position), np.asarray(place.target), up, place.fov_deg)
 
 
 def _endoscope(anatomy: Anatomy, direction: FloatArray, up: FloatArray) -> Camera:
-    """A camera in a direction from the palpable face, as far from it as the face is wide within bounds."""
+    """Camera in a direction from the palpable face, at the face's width from it, within ENDOSCOPE_DISTANCES."""
     face = anatomy.mesh.points[np.unique(anatomy.face.triangles)]
     middle = 0.5 * (face.min(axis=0) + face.max(axis=0))
     seen = (face - middle) @ Camera.looking(middle + direction, middle, up, ENDOSCOPE_FOV).rotation

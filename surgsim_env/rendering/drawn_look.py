@@ -1,4 +1,4 @@
-"""A look put on a drawn scene: colours, gloss, vessels and lights of its model, which renderers of one stage share."""
+"""Look of a drawn scene: colours, gloss, vessels and lights of its model."""
 
 import mujoco
 import numpy as np
@@ -8,7 +8,7 @@ from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.scene_model import TARGET_COLOUR, VESSELS, SceneModel
 from surgsim_env.rendering.vessels import vessel_texture
 
-# Meshes of tissue, brightness of "held" relative to "organ", and whether vessels are drawn on them.
+# Meshes of tissue, and brightness of "held" relative to "organ".
 TISSUE = ("organ", "held")
 HELD_BRIGHTNESS = 1.2
 # Brightness of supports relative to the drape.
@@ -17,7 +17,7 @@ _RGB, _ROLES = int(mujoco.mjtTextureRole.mjTEXROLE_RGB), int(mujoco.mjtTextureRo
 
 
 class DrawnLook:
-    """The look of a drawn scene; None is the scene's own."""
+    """Current look of a drawn scene; None is the scene's own."""
 
     def __init__(self, scene: SceneModel, context: mujoco.MjrContext, *, has_vessels: bool) -> None:
         """Keep the scene's own colours and lights; without vessels tissue has one colour."""
@@ -46,7 +46,7 @@ class DrawnLook:
         return TARGET_COLOUR if self._worn is None else self._worn.target
 
     def put_on(self, look: Look | None) -> None:
-        """Take a look, in place of the one before."""
+        """Replace the current look."""
         if look == self._worn:
             return
         for array, own in self._changed:

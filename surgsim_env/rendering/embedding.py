@@ -1,4 +1,4 @@
-"""A fine surface that moves with the tets it lies around: each vertex a fixed mix of nodes, found once at rest."""
+"""Fine surface carried by a tet mesh: each vertex is a fixed linear combination of nodes, computed at rest."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +15,7 @@ from surgsim_env.scene.anatomy import Anatomy
 
 @dataclass(frozen=True, eq=False)
 class EmbeddedSurface:
-    """A surface that the boundary of a mesh carries; the other kind of surface that is drawn is `DrawnSurface`.
+    """Surface carried by the boundary of a mesh; the other kind of drawn surface is `DrawnSurface`.
 
     With p a vertex at rest, q the nearest point of the boundary, b the weights there of its triangle's corners X, and
     F the deformation gradient at each corner (the mean of the tets around it), the vertex is drawn at
@@ -40,12 +40,12 @@ class EmbeddedSurface:
 
     @property
     def faces(self) -> IntArray:
-        """Vertices of the triangles, outward, (n_face, 3)."""
+        """Vertices of the triangles, outward, shape (n_face, 3)."""
         return self.corners.T
 
     @property
     def vertex_count(self) -> int:
-        """Number of vertices that are drawn."""
+        """Number of drawn vertices."""
         return len(self.weights.indptr) - 1
 
     def follow(self, node_position: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -62,14 +62,14 @@ class EmbeddedSurface:
         return self.node_weights @ values
 
     def faces_among(self, nodes: IntArray) -> NDArray[np.bool_]:
-        """Which triangles lie on a part of the boundary whose nodes are all among some, (n_face,)."""
+        """True for triangles on a part of the boundary with all its nodes among `nodes`, shape (n_face,)."""
         among = np.zeros(self.node_count)
         among[nodes] = 1.0
         return np.asarray((self.interpolate(among) > 1.0 - 1e-9)[self.faces].all(axis=1))
 
 
 def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> EmbeddedSurface:
-    """A surface that moves with a mesh.
+    """Embed a surface in a mesh.
 
     Args:
         vertices: at rest [m], (n_vertex, 3).
@@ -79,11 +79,11 @@ def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> Em
     Raises:
         MeshError: a vertex farther from the mesh's boundary than `msdm_core.mesh.carriers.REACH` allows; names it.
     """
-    found, triangles, nodes = surface_carriers(vertices, mesh), mesh.boundary_triangles, mesh.boundary_nodes
-    corners = triangles[found.triangle]
-    onto = vertices - found.nearest
-    lever = found.weights[:, :, None] * (onto[:, None] + 0.5 * (found.nearest[:, None] - mesh.points[corners]))
-    node_weights = _rows(corners, found.weights, mesh.node_count)
+    carriers, triangles, nodes = surface_carriers(vertices, mesh), mesh.boundary_triangles, mesh.boundary_nodes
+    corners = triangles[carriers.triangle]
+    onto = vertices - carriers.nearest
+    lever = carriers.weights[:, :, None] * (onto[:, None] + 0.5 * (carriers.nearest[:, None] - mesh.points[corners]))
+    node_weights = _rows(corners, carriers.weights, mesh.node_count)
     components = (3 * np.searchsorted(nodes, corners)[:, :, None] + np.arange(3)).reshape(-1, 9)
     levers = _rows(components, lever.reshape(-1, 9), 3 * len(nodes))
     face = np.repeat(np.arange(len(faces)), 3)
@@ -99,7 +99,7 @@ def embedded_surface(vertices: FloatArray, faces: IntArray, mesh: TetMesh) -> Em
 
 @lru_cache(maxsize=4)
 def organ_surface(anatomy: Anatomy, triangles_most: int = TRIANGLES_MOST) -> DrawnSurface | EmbeddedSurface:
-    """The surface of an organ that is drawn: the scene's fine surface, or without one `boundary_surface`.
+    """Drawn surface of an organ: the scene's fine surface, or without one `boundary_surface`.
 
     Raises:
         MeshError: the fine surface's file cannot be read, or is not of this organ.
@@ -110,7 +110,7 @@ def organ_surface(anatomy: Anatomy, triangles_most: int = TRIANGLES_MOST) -> Dra
 
 
 def boundary_surface(anatomy: Anatomy, triangles_most: int = TRIANGLES_MOST) -> DrawnSurface:
-    """The boundary of an organ's mesh, smoothed, with at most so many small triangles if the mesh has no more."""
+    """Smoothed boundary of an organ's mesh; split into at most `triangles_most` triangles, if the mesh has no more."""
     return drawn_surface(anatomy.mesh.points, anatomy.mesh.boundary_triangles, triangles_most)
 
 
@@ -119,9 +119,9 @@ def _rows(columns: IntArray, entries: FloatArray, column_count: int) -> csr_arra
     return csr_array(coo_array((entries.ravel(), (rows, columns.ravel())), shape=(len(columns), column_count)))
 
 
-def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    # A third of the time of numpy's.
-    product = np.empty_like(one)
-    for axis, (next_axis, last) in enumerate(((1, 2), (2, 0), (0, 1))):
-        product[:, axis] = one[:, next_axis] * other[:, last] - one[:, last] * other[:, next_axis]
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    # Takes a third of numpy's time.
+    product = np.empty_like(first)
+    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        product[:, axis] = first[:, i] * second[:, j] - first[:, j] * second[:, i]
     return product

@@ -1,4 +1,4 @@
-"""Rendering of an environment by its render_mode: pictures, or a live window."""
+"""Rendering of an environment by its render_mode: pictures or a live window."""
 
 import ctypes.util
 import os
@@ -24,15 +24,13 @@ if TYPE_CHECKING:
     from surgsim_env.rendering.renderer import OrganRenderer
 
 RENDER_MODES = ("human", "rgb_array")
-# Keys that a task may read; GLFW's code of a key is that of its letter.
-PLAYING_KEYS = "ADEFQRSW "
 
 
 class WindowContext:
     """A GLFW window as a graphics context."""
 
     def __init__(self, title: str, width: int, height: int) -> None:
-        """Open it.
+        """Open the window.
 
         Raises:
             NoGLError: there is no display, or no OpenGL on it.
@@ -61,10 +59,10 @@ class WindowContext:
 
 
 class Window:
-    """A window with a renderer's pictures at the rate of control steps; once closed, it stays closed."""
+    """Window with a renderer's pictures at the rate of control steps; once closed, it stays closed."""
 
     def __init__(self, renderer: "OrganRenderer", context: WindowContext, period: float) -> None:
-        """Attach to an open window; a period [s] at least lies between two pictures."""
+        """Attach to an open window; `period` is the shortest time between two pictures [s]."""
         self._renderer, self._context, self._period = renderer, context, period
         self._camera_name = renderer.options.camera
         self._next = time.monotonic()
@@ -73,7 +71,7 @@ class Window:
         glfw.set_key_callback(handle, lambda _, key, __, action, ___: self._key(key, action))
 
     def show(self) -> None:
-        """Draw the current state, and wait until the next picture is due."""
+        """Draw the current state and wait until the next picture is due."""
         glfw, handle = self._context._glfw, self._context.handle
         if self.closed:
             return
@@ -105,14 +103,14 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Parts of an episode's picture that the simulation does not contain.
+    """Parts of an episode's picture beyond the simulation.
 
     Fields:
-        lesions: hidden in the organ; shown where the options ask for them
-        target: a disc to be drawn, None for none
+        lesions: hidden in the organ; shown if the options ask for them
+        target: a disc, None for none
         endoscope: pose of the endoscope; None: that of the scene
         look: of the pictures; None: the scene's own
-        moment: counts the steps of the episode
+        moment: number of the episode's step
     """
 
     lesions: tuple[Lesion, ...] = ()
@@ -123,15 +121,15 @@ class Shown:
 
 
 class EpisodeView:
-    """The pictures of one environment; OpenGL is loaded with the first of them.
+    """Pictures of one environment; OpenGL is loaded with the first.
 
     Fields:
-        mode, options: as given
+        mode, options: render mode and picture options
         window: the live window, None until it is open
     """
 
-    def __init__(self, simulation: Simulation, render_mode: str | None, given: dict[str, Any]) -> None:
-        """Check the mode and the options that were given; nothing is drawn yet.
+    def __init__(self, simulation: Simulation, render_mode: str | None, options: dict[str, Any]) -> None:
+        """Check mode and options; nothing is drawn yet.
 
         Raises:
             ValueError: an unknown mode or option, or an option's value that breaks its rule.
@@ -145,18 +143,18 @@ class EpisodeView:
                 'set): use render_mode="rgb_array", which needs none'
             )
         self.mode = render_mode
-        self.options = render_options(given)
+        self.options = render_options(options)
         self._simulation = simulation
         self._renderer: OrganRenderer | None = None
         self.window: Window | None = None
 
     def metadata(self) -> dict[str, Any]:
-        """Gymnasium's metadata: the modes that this machine offers (and the current one), and one picture a step."""
+        """Gymnasium's metadata: the machine's render modes (and the current one), and one picture a step."""
         modes = [mode for mode in RENDER_MODES if mode == self.mode or mode in offered_modes()]
         return {"render_modes": modes, "render_fps": round(1.0 / self._simulation.anatomy.scene.timing.control_step)}
 
     def renderer(self, shown: Shown) -> "OrganRenderer":
-        """The renderer, with the lesions, target and endoscope of an episode."""
+        """Renderer with the lesions, target, look and endoscope of an episode."""
         if self._renderer is None:
             self._renderer = self._new_renderer()
         self._renderer.follow_anatomy()
@@ -168,11 +166,11 @@ class EpisodeView:
         return self._renderer
 
     def frame(self, shown: Shown) -> NDArray[np.uint8]:
-        """The picture of the current state, shape (height, width, 3)."""
+        """Picture of the current state, shape (height, width, 3)."""
         return self.renderer(shown).rgb()
 
     def show(self, shown: Shown) -> None:
-        """Show the current state in the window, which opens at the first call."""
+        """Show the current state in the window; the first call opens it."""
         if self.window is None:
             context = WindowContext("surgsim", self.options.width, self.options.height)
             self._renderer = self._new_renderer(context)
@@ -182,7 +180,7 @@ class EpisodeView:
         self.window.show()
 
     def _new_renderer(self, context: WindowContext | None = None) -> "OrganRenderer":
-        """A renderer, into a window's context or off screen; an episode without pictures does not import it."""
+        """Renderer into a window's context or off screen; imported here, since most episodes draw nothing."""
         from surgsim_env.rendering.renderer import OrganRenderer
 
         return OrganRenderer(self._simulation, self.options, gl_context=context)
@@ -196,13 +194,13 @@ class EpisodeView:
 
 
 def offered_modes() -> list[str]:
-    """The render modes that this machine offers, as far as is known without loading OpenGL."""
+    """Render modes of this machine, as far as is known without loading OpenGL."""
     switched_on = os.environ.get(gl.VARIABLE, "").lower().strip() not in gl.SWITCHED_OFF
-    offered = {"human": switched_on and gl.has_display(), "rgb_array": switched_on and _has_library()}
-    return [mode for mode in RENDER_MODES if offered[mode]]
+    available = {"human": gl.has_display(), "rgb_array": _has_library()}
+    return [mode for mode in RENDER_MODES if switched_on and available[mode]]
 
 
 @cache
 def _has_library() -> bool:
-    """Whether the library is installed that draws without a display."""
+    """True if the library for drawing without a display is installed."""
     return not sys.platform.startswith("linux") or ctypes.util.find_library("EGL") is not None

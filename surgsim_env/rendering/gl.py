@@ -6,52 +6,52 @@ import sys
 from functools import cache
 from typing import Any
 
-# MuJoCo's variable, its values that switch OpenGL off, and the module of each kind of context.
+# MuJoCo's environment variable, its values for no OpenGL, and the module of each kind of context.
 VARIABLE = "MUJOCO_GL"
 SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 MODULES = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw", "glx": "mujoco.glfw"}
 
-# Variables of the environment that name a display for windows.
+# Environment variables that name a display for windows.
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 class NoGLError(RuntimeError):
-    """There is no OpenGL; the message says what is missing and how to install it."""
+    """There is no OpenGL; the message names the missing packages and their installation."""
 
 
 def has_display() -> bool:
-    """Whether a window can be opened, by the environment's variables."""
+    """True if a window can be opened, by the environment variables."""
     return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)
 
 
 def context() -> Any:
-    """This process's context for drawing off screen, made at the first call.
+    """Context of this process for drawing off screen, created at the first call.
 
     Raises:
-        NoGLError: it cannot be made; names the packages that are missing.
+        NoGLError: it cannot be created (names the missing packages), or the process was forked from one with a context.
     """
-    made, owner = _first_context()
+    gl_context, owner = _first_context()
     if owner != os.getpid():
         raise NoGLError(
             "this process was forked from one that had already drawn, and OpenGL does not survive a fork: start "
             'workers with AsyncVectorEnv(..., context="forkserver"), or draw nothing before they start'
         )
-    return made
+    return gl_context
 
 
 @cache
 def _first_context() -> tuple[Any, int]:
-    """The context, and the id of the process that made it."""
+    """Context and the id of its process."""
     return _make_context(_kind()), os.getpid()
 
 
 def _kind() -> str:
-    """The kind of context that MUJOCO_GL names; if it is unset, EGL on Linux, which needs no display."""
-    asked = os.environ.get(VARIABLE, "").lower().strip()
-    if asked in SWITCHED_OFF:
-        raise NoGLError(f"{VARIABLE} is {asked!r}, which switches OpenGL off: unset it, or set {VARIABLE}=egl")
-    if asked in MODULES:
-        return asked
+    """Kind of context named by MUJOCO_GL; EGL on Linux if it is unset, since that needs no display."""
+    kind = os.environ.get(VARIABLE, "").lower().strip()
+    if kind in SWITCHED_OFF:
+        raise NoGLError(f"{VARIABLE} is {kind!r}, which switches OpenGL off: unset it, or set {VARIABLE}=egl")
+    if kind in MODULES:
+        return kind
     return "egl" if sys.platform.startswith("linux") else ""
 
 
@@ -60,14 +60,14 @@ def _make_context(kind: str) -> Any:
         if kind in ("glfw", "glx") and not has_display():
             raise NoGLError(f"{' and '.join(DISPLAYS)} are not set")
         module = importlib.import_module(MODULES.get(kind, "mujoco.gl_context"))
-        # EGL asks for no size, the others make a window that is never shown.
+        # A size for the hidden window of other kinds than EGL.
         return module.GLContext(64, 64)
-    except Exception as error:  # each library raises another error where it is missing
+    except Exception as error:  # each missing library raises its own type
         raise NoGLError(no_gl_message(kind, error)) from error
 
 
 def no_gl_message(kind: str, error: Exception) -> str:
-    """Message for a kind of context that could not be made, with the way out."""
+    """Message for a failed kind of context, with the remedy."""
     cause = f"{type(error).__name__}: {error}"
     if kind in ("glfw", "glx"):
         return f"no OpenGL through GLFW ({cause}): it needs a display; without one unset {VARIABLE} or set it to egl"

@@ -1,6 +1,6 @@
-"""Looks of a picture: what random looks draw of camera, light, colours, vessels, gloss and noise, and their ranges.
+"""Domain randomisation of pictures: a look's camera, light, colours, vessels, gloss and noise, and their ranges.
 
-A look changes pictures and nothing of the simulation. Ranges of training and evaluation share no hue and no spacing of
+A look changes pictures alone, not the simulation. Ranges of training and evaluation share no hue and no spacing of
 vessels, and their looks come from different streams of random numbers.
 """
 
@@ -18,21 +18,21 @@ from surgsim_env.scene.palpable_surface import tangent_axes
 Range = tuple[float, float]
 Bands = tuple[Range, ...]
 
-# Of the seeds that belong to looks, among those that follow from an episode's (`SeedSequence.spawn_key`).
+# Spawn key (`SeedSequence.spawn_key`) of the looks' random numbers, apart from those of the episode.
 LOOK_STREAM = 0x4C_6F_6F_6B
-# Seeds of textures and of noise lie below.
+# Upper bound of the seeds of textures and noise.
 SEEDS_MOST = 2**31
 
 
-# Camera: its move as a share of its distance from its target, turn about a random axis across the view [degrees], roll
+# Camera: shift as a share of its distance from its target, turn about a random axis across the view [degrees], roll
 # of the picture [degrees], factor on the vertical field of view.
 CAMERA_SHIFT, CAMERA_TURN, CAMERA_ROLL, FOV_FACTOR = (0.0, 0.05), (0.0, 2.0), (-5.0, 5.0), (0.76, 0.92)
-# Light: turn of the lamps [degrees], factors on lamps and headlight, share added to red and taken from blue.
+# Light: tilt of the lamps [degrees], factors on lamps and headlight, share added to red and taken from blue.
 LIGHT_TILT, LIGHT_STRENGTH, WARMTH = (0.0, 25.0), (0.7, 1.35), (-0.12, 0.18)
 # Saturation and value of the colours of tissue, and of drape and supports.
 TISSUE_COLOUR, DRAPE_COLOUR = ((0.55, 0.85), (0.35, 0.62)), ((0.25, 0.75), (0.2, 0.5))
 INSTRUMENT_BRIGHTNESS = (0.7, 1.1)
-# Vessels: how much darker than tissue, and the share of the surface that they take, about.
+# Vessels: darkness relative to tissue, and approximate share of the surface.
 VESSEL_STRENGTH, VESSEL_WIDTH = (0.0, 0.6), (0.1, 0.3)
 # The tissue's highlights: strength and narrowness.
 GLOSS, SHARPNESS = (0.1, 1.0), (0.4, 0.95)
@@ -42,10 +42,10 @@ EXPOSURE, NOISE = (0.8, 1.2), (0.0, 0.03)
 
 @dataclass(frozen=True)
 class LookRanges:
-    """Ranges in which the looks of a split differ from those of another; several (low, high) each.
+    """Ranges of a split that differ from those of the other split; several (low, high) each.
 
     Fields:
-        stream: number of the random numbers that draw the looks
+        stream: number of the split's stream of random numbers
         tissue_hue_bands, drape_hue_bands, target_hue_bands: [degrees], of the colour wheel
         vessel_bands: vessels crossed on a metre of surface [1/m]
     """
@@ -79,7 +79,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Look:
-    """One look; numbers alone.
+    """Parameters of a picture's appearance.
 
     Fields:
         shift: of the camera along its right, up and way back, as shares of its distance from its target    (3,)
@@ -90,7 +90,7 @@ class Look:
         lamp, head: factors on lamps and headlight for red, green and blue                                  (3,) each
         tissue, drape, target: colours
         instrument: factor on its colours
-        vessel_density, vessel_strength, vessel_width: crossed on a metre [1/m], darkness, and share of the surface
+        vessel_density, vessel_strength, vessel_width: crossed on a metre [1/m], darkness, share of the surface
         gloss, sharpness: of the tissue's highlights
         exposure, noise: factor on the picture, and a pixel's standard deviation as a share of full scale
         seed: of the vessels and the noise
@@ -117,7 +117,7 @@ class Look:
     seed: int
 
     def seen_from(self, camera: Camera) -> Camera:
-        """A camera moved, turned and zoomed as the look has it."""
+        """Camera shifted, turned and zoomed by the look."""
         distance = float(np.linalg.norm(camera.target - camera.position))
         position = camera.position + distance * (camera.rotation @ np.array(self.shift))
         right, up = (math.tan(math.radians(angle)) * distance for angle in self.turn)
@@ -131,13 +131,13 @@ class Look:
         return Camera(position, target, camera.up, rotation, camera.fov * self.fov_factor)
 
     def lit(self, direction: FloatArray, down: FloatArray) -> FloatArray:
-        """The unit direction (3,) of a lamp's light turned as the look has it, where instruments come along `down`."""
+        """Unit direction (3,) of a lamp's light tilted by the look; `down` is the approach of instruments."""
         across, along = tangent_axes(down)
         turned = direction + self.light_turn[0] * across + self.light_turn[1] * along
         return turned / np.linalg.norm(turned)
 
     def exposed(self, frame: NDArray[np.uint8], moment: int) -> NDArray[np.uint8]:
-        """A picture (height, width, 3) with exposure and the noise of a moment, which has its own random numbers."""
+        """Picture (height, width, 3) with exposure and noise; each moment has its own random numbers."""
         values = frame.astype(np.float32) * np.float32(self.exposure)
         if self.noise > 0.0:
             numbers = np.random.Generator(np.random.Philox(key=self.seed, counter=[0, 0, 0, moment]))
@@ -146,10 +146,10 @@ class Look:
 
 
 def find_look_ranges(split: str) -> LookRanges:
-    """The ranges of a split by its name.
+    """Ranges of a split by its name.
 
     Raises:
-        ValueError: an unknown split (lists the known).
+        ValueError: an unknown split (lists the known ones).
     """
     if split not in LOOK_SPLITS:
         raise ValueError(f"looks is {split!r}; it must be None, {' or '.join(map(repr, LOOK_SPLITS))}")
@@ -157,18 +157,18 @@ def find_look_ranges(split: str) -> LookRanges:
 
 
 def look_generator(ranges: LookRanges, seed: int) -> np.random.Generator:
-    """The random numbers of the looks of ranges, for an environment's seed; no environment draws from them."""
+    """Random numbers of a split's looks for an environment's seed, apart from the environment's own."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(LOOK_STREAM, ranges.stream)))
 
 
 def draw_look(ranges: LookRanges, rng: np.random.Generator) -> Look:
     """Draw a look from ranges."""
 
-    def one(limits: Range) -> float:
+    def uniform(limits: Range) -> float:
         return float(rng.uniform(*limits))
 
-    def among(bands: Bands) -> float:
-        # A wider band is drawn more often.
+    def from_bands(bands: Bands) -> float:
+        # Uniform over the union of the bands.
         place = rng.uniform(0.0, sum(high - low for low, high in bands))
         for low, high in bands:
             if place <= high - low:
@@ -176,38 +176,38 @@ def draw_look(ranges: LookRanges, rng: np.random.Generator) -> Look:
             place -= high - low
         return bands[-1][1]
 
-    way = rng.normal(size=3)
-    shift = way / np.linalg.norm(way) * one(CAMERA_SHIFT)
+    direction = rng.normal(size=3)
+    shift = direction / np.linalg.norm(direction) * uniform(CAMERA_SHIFT)
     angle = rng.uniform(0.0, 2.0 * math.pi)
-    turn = one(CAMERA_TURN) * np.array([math.cos(angle), math.sin(angle)])
-    roll, fov = one(CAMERA_ROLL), one(FOV_FACTOR)
+    turn = uniform(CAMERA_TURN) * np.array([math.cos(angle), math.sin(angle)])
+    roll, fov_factor = uniform(CAMERA_ROLL), uniform(FOV_FACTOR)
     angle = rng.uniform(0.0, 2.0 * math.pi)
-    light = math.tan(math.radians(one(LIGHT_TILT))) * np.array([math.cos(angle), math.sin(angle)])
-    warm = one(WARMTH)
+    light = math.tan(math.radians(uniform(LIGHT_TILT))) * np.array([math.cos(angle), math.sin(angle)])
+    warm = uniform(WARMTH)
     white = np.array([1.0 + warm, 1.0, 1.0 - warm])
-    lamp, head = one(LIGHT_STRENGTH) * white, one(LIGHT_STRENGTH) * white
-    tissue = _colour(among(ranges.tissue_hue_bands), *map(one, TISSUE_COLOUR))
-    drape = _colour(among(ranges.drape_hue_bands), *map(one, DRAPE_COLOUR))
-    target = _colour(among(ranges.target_hue_bands), 0.73, 0.75)
+    lamp, head = uniform(LIGHT_STRENGTH) * white, uniform(LIGHT_STRENGTH) * white
+    tissue = _colour(from_bands(ranges.tissue_hue_bands), *map(uniform, TISSUE_COLOUR))
+    drape = _colour(from_bands(ranges.drape_hue_bands), *map(uniform, DRAPE_COLOUR))
+    target = _colour(from_bands(ranges.target_hue_bands), 0.73, 0.75)
     return Look(
         shift=_triple(shift),
         turn=(float(turn[0]), float(turn[1])),
         roll=roll,
-        fov_factor=fov,
+        fov_factor=fov_factor,
         light_turn=(float(light[0]), float(light[1])),
         lamp=_triple(lamp),
         head=_triple(head),
         tissue=tissue,
         drape=drape,
         target=target,
-        instrument=one(INSTRUMENT_BRIGHTNESS),
-        vessel_density=among(ranges.vessel_bands),
-        vessel_strength=one(VESSEL_STRENGTH),
-        vessel_width=one(VESSEL_WIDTH),
-        gloss=one(GLOSS),
-        sharpness=one(SHARPNESS),
-        exposure=one(EXPOSURE),
-        noise=one(NOISE),
+        instrument=uniform(INSTRUMENT_BRIGHTNESS),
+        vessel_density=from_bands(ranges.vessel_bands),
+        vessel_strength=uniform(VESSEL_STRENGTH),
+        vessel_width=uniform(VESSEL_WIDTH),
+        gloss=uniform(GLOSS),
+        sharpness=uniform(SHARPNESS),
+        exposure=uniform(EXPOSURE),
+        noise=uniform(NOISE),
         seed=int(rng.integers(SEEDS_MOST)),
     )
 

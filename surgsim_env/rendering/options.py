@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from typing import Any
 
-# The cameras that every scene has.
+# Cameras of each scene.
 CAMERAS = ("overview", "endoscope", "side", "above")
 # Largest side of a picture [pixels] that any OpenGL driver can draw.
 PIXELS_MOST = 4096
@@ -45,21 +45,21 @@ class RenderOptions:
 
 
 def check_camera(camera: str) -> None:
-    """Raise a ValueError that lists the cameras if there is none of that name."""
+    """Raise a ValueError with the known cameras if there is none of that name."""
     if camera not in CAMERAS:
         raise ValueError(f"camera {camera!r} is unknown; the cameras are {', '.join(CAMERAS)}")
 
 
-def render_options(given: dict[str, Any]) -> RenderOptions:
-    """Options from keyword arguments.
+def render_options(arguments: dict[str, Any]) -> RenderOptions:
+    """Options of pictures from keyword arguments.
 
     Raises:
-        ValueError: an argument that is no option (suggests the nearest), or a value that breaks its rule.
+        ValueError: an unknown argument (suggests the nearest), or a value that breaks its rule.
     """
     known = [option.name for option in fields(RenderOptions)]
-    for name in given:
+    for name in arguments:
         if name not in known:
             nearest = get_close_matches(name, known, n=1)
             hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
             raise ValueError(f"argument {name!r} is unknown; for pictures there are {', '.join(known)}{hint}")
-    return RenderOptions(**given)
+    return RenderOptions(**arguments)

@@ -1,4 +1,4 @@
-"""The renderer of a simulation, for the environments' `render` and by itself; pictures of arms on an organ at rest."""
+"""Renderer of a simulation, and still pictures of arms on an organ at rest."""
 
 import contextlib
 import math
@@ -33,33 +33,32 @@ from surgsim_env.rendering.tissue import Tissue
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
 
-# How far above the drape the shadow lies [m].
+# Height of the shadow above the drape [m].
 SHADOW_GAP = 0.0002
-# A force whose label would be "0.00 N" is not drawn [N].
+# Smallest drawn force [N]; below, its label would be "0.00 N".
 SMALLEST_FORCE = 0.005
-# Length of a force's arrow in the scene [m/N].
+# Length of a force's arrow [m/N].
 FORCE_LENGTH = 0.06
 ARROW_COLOUR, ARROW_OUTLINE, LABEL_BACK = (255, 214, 10, 255), (25, 22, 0, 255), (10, 14, 18, 165)
 # Half width of the shaft, half width and length of the head, outline, at a picture height of 480 [pixels].
 ARROW_SHAFT, ARROW_HEAD_WIDTH, ARROW_HEAD_LENGTH, ARROW_EDGE, TEXT_SIZE = 3.0, 8.0, 16.0, 1.3, 15.0
-# Room for head and label beyond the arrow's ends: to the left and up, to the right and down, likewise [pixels].
+# Room for head and label beyond the arrow's ends: to the left and up, to the right and down, also [pixels].
 ARROW_ROOM = np.array([[20.0, 36.0], [95.0, 36.0]])
-# The arrow is painted larger by this factor and scaled down, so that its edges are smooth.
+# The arrow is painted larger by this factor and scaled down: antialiasing.
 OVERSAMPLING = 3
-# Of pictures without a simulation: background, and far clipping plane [m], which shows the whole length of an arm.
+# Background of still pictures, and their far clipping plane [m], beyond the length of an arm.
 STILL_BACKGROUND, STILL_FAR = (0.93, 0.95, 0.96), 10.0
 
 
 class OrganRenderer:
-    """Colour, depth and labels of the current state of a simulation, which is read and never changed.
+    """Colour, depth and labels of the current state of a simulation, without changing it.
 
         renderer = OrganRenderer(simulation, RenderOptions(camera="endoscope"))
         frame = renderer.rgb()
 
-    Assign the episode's lesions to `lesions`: they are shown where the options ask for them; `target` is a disc to be
-    shown. With a `look` cameras called by name are moved, and colour pictures have its noise of the `moment`, which is
-    the number of the episode's step. OpenGL is loaded with the first picture. Renderers of one anatomy and size share
-    one stage.
+    `lesions` are the episode's, shown if the options ask for them; `target` is a disc to be shown. A `look` shifts
+    cameras given by name and adds its noise of the `moment`, the number of the episode's step, to colour. OpenGL
+    is loaded with the first picture. Renderers of one anatomy and size share one stage.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class OrganRenderer:
         lesions: Sequence[Lesion] = (),
         gl_context: Any = None,
     ) -> None:
-        """Load nothing yet; `gl_context` is a window's, None for pictures off screen."""
+        """Take a simulation; `gl_context` is a window's, None for pictures off screen. Graphics are loaded later."""
         self.options = options or RenderOptions()
         self.cameras: dict[str, Camera] = {}
         self.lesions: tuple[Lesion, ...] = tuple(lesions)
@@ -86,7 +85,7 @@ class OrganRenderer:
         self.follow_anatomy()
 
     def follow_anatomy(self) -> None:
-        """Take cameras and graphics of another member of the family where the simulation has one."""
+        """Replace cameras and graphics if the simulation has changed to another member of its family."""
         anatomy = self._simulation.anatomy
         if self._anatomy is anatomy:
             return
@@ -95,14 +94,14 @@ class OrganRenderer:
         self.cameras.update(scene_cameras(anatomy, self.options.width / self.options.height))
 
     def rgb(self, camera: str | Camera | None = None) -> NDArray[np.uint8]:
-        """The picture, shape (height, width, 3), its first row on top.
+        """Picture of the current state, shape (height, width, 3), its first row on top.
 
         Args:
-            camera: the name of one of `cameras`, or a camera of your own; that of the options if left out.
+            camera: a name in `cameras`, or a camera of your own; that of the options if left out.
 
         Raises:
-            ValueError: an unknown camera; lists the known ones.
-            NoGLError: there is no OpenGL; names the packages that are missing.
+            ValueError: an unknown camera (lists the known ones).
+            NoGLError: there is no OpenGL; names the missing packages.
         """
         view = self._camera(camera)
         with self._shown(view) as stage:
@@ -114,7 +113,7 @@ class OrganRenderer:
         return frame
 
     def depth(self, camera: str | Camera | None = None) -> NDArray[np.float32]:
-        """Distance of each pixel from the camera's plane [m], infinite where there is nothing, shape (height, width).
+        """Distance of each pixel from the camera's plane [m], infinite for background, shape (height, width).
 
         The surface of a translucent organ counts; the force arrow does not.
         """
@@ -122,9 +121,9 @@ class OrganRenderer:
             return stage.depth()
 
     def segmentation(self, camera: str | Camera | None = None) -> NDArray[np.uint8]:
-        """Label of each pixel, one of `stage.LABELS`, shape (height, width).
+        """Label of each pixel by `stage.LABELS`, shape (height, width).
 
-        Lesions have pixels where the options show them; in a translucent organ those that are seen through it.
+        Lesions are labelled if the options show them, also through a translucent organ.
         """
         with self._shown(self._camera(camera)) as stage:
             return stage.labels()
@@ -136,11 +135,11 @@ class OrganRenderer:
             self._stage = self._tissue = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy draws the same and loads graphics of its own."""
+        """State without graphics: a copy loads its own."""
         return {**self.__dict__, "_stage": None, "_tissue": None, "_finalizer": None}
 
     def present(self, frame: NDArray[np.uint8]) -> None:
-        """Show a picture in the window whose context this renderer uses."""
+        """Show a picture in the renderer's window."""
         canvas = self._ready_stage().canvas
         with LOCK:
             canvas.gl_context.make_current()
@@ -148,7 +147,7 @@ class OrganRenderer:
 
     @contextlib.contextmanager
     def _shown(self, camera: Camera) -> Iterator[Stage]:
-        """The stage, showing the simulation as it is now to a camera, with its graphics context current."""
+        """Stage with the simulation's current state before a camera; its graphics context is current."""
         with LOCK:
             stage = self._ready_stage()
             stage.canvas.gl_context.make_current()
@@ -180,21 +179,20 @@ class OrganRenderer:
             self._tissue = Tissue(simulation.anatomy, stage.surface, shown, options.cut_away)
             self._tissue_lesions = shown
         nodes, tissue, scene = simulation.organ_state.node_position, self._tissue, stage.scene
-        axes = [lesion.half_axes for lesion in tissue.lesions]
         shapes = tissue.shapes(nodes)
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             triangles = simulation.anatomy.mesh.boundary_triangles
             light = scene.light if self.look is None else self.look.lit(scene.light, -up)
             shapes["shadow"] = ground_shadow(nodes, triangles, light, scene.ground, up)
-        lesions = list(zip(tissue.lesion_centres(nodes), axes)) if options.show_lesion else []
+        lesions = tissue.lesion_ellipsoids(nodes) if options.show_lesion else []
         stage.show(camera, shapes, simulation.instrument.data, lesions, self.target, self.look)
 
 
 def ground_shadow(
     points: FloatArray, triangles: IntArray, light: FloatArray, ground: FloatArray, up: FloatArray
 ) -> Shape:
-    """The lit triangles pushed along the light onto the plane through `ground` [m] across the unit direction `up`."""
+    """Projection of the lit triangles along the light onto the plane through `ground` [m] with unit normal `up`."""
     height = (points - ground) @ up - SHADOW_GAP
     flat = points - (height / (light @ up))[:, None] * light
     corners = flat[triangles]
@@ -204,7 +202,7 @@ def ground_shadow(
 
 @dataclass(frozen=True, eq=False)
 class DrawnCapsule:
-    """A capsule, or a ball where both ends are the same.
+    """Capsule, or a ball if both ends coincide.
 
     Fields:
         ends: of its axis [m]                                                       (2, 3)
@@ -224,17 +222,17 @@ def draw_still(
     cameras: Sequence[Camera],
     size: tuple[int, int],
 ) -> list[NDArray[np.uint8]]:
-    """A picture (height, width, 3) from each camera.
+    """Draw a picture (height, width, 3) for each camera.
 
     Args:
         surface: points [m] (n_node, 3) and outward triangles (n_triangle, 3) of the organ; None without one.
-        arms: models and data, their kinematics computed; drawn as they are posed.
-        capsules: whatever else is there.
-        cameras: the first one's `up` is up in the scene.
+        arms: models and data, with computed kinematics.
+        capsules: further shapes.
+        cameras: the first one's `up` is the scene's.
         size: width and height [pixels].
 
     Raises:
-        NoGLError: there is no OpenGL; names the packages that are missing.
+        NoGLError: there is no OpenGL; names the missing packages.
     """
     context = gl.context()
     organ = None if surface is None else drawn_surface(*surface)
@@ -251,8 +249,8 @@ def draw_still(
         else:
             geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, capsule.ends.ravel()
     model, data, meshes = compile_scene(spec, [] if organ is None else ["organ"])
-    for number, (arm, posed) in enumerate(arms):
-        find_instrument(model, arm, f"arm_{number}").pose(posed, data)
+    for number, (arm, arm_data) in enumerate(arms):
+        find_instrument(model, arm, f"arm_{number}").pose(arm_data, data)
     with LOCK:
         context.make_current()
         canvas = Canvas(model, data, context)
@@ -271,7 +269,7 @@ def draw_still(
 
 
 def draw_forces(frame: NDArray[np.uint8], simulation: Simulation, camera: Camera) -> None:
-    """Paint the force on each tool into a picture (height, width, 3), as seen by its camera."""
+    """Paint the tissue's force on each tool, with its size in newtons, into a camera's picture (height, width, 3)."""
     for tool, force in enumerate(simulation.contact_wrench[:, :3]):
         size = float(np.linalg.norm(force))
         if size < SMALLEST_FORCE:
@@ -279,13 +277,13 @@ def draw_forces(frame: NDArray[np.uint8], simulation: Simulation, camera: Camera
         start = contact_point(simulation, tool)
         ends = np.stack([start, start + FORCE_LENGTH * force])
         pixels, depth = camera.project(ends, frame.shape[1], frame.shape[0])
-        # After a fault positions may not be finite.
+        # After a divergence positions may not be finite.
         if (depth > 0.0).all() and np.isfinite(pixels).all():
             _paint_arrow(frame, pixels, f"{size:.2f} N")
 
 
 def contact_point(simulation: Simulation, tool: int) -> FloatArray:
-    """Middle of the surface that a tool touches [m], shape (3,); the tool's centre of mass without contact."""
+    """Middle of a tool's contact area [m], shape (3,); the tool's centre of mass without contact."""
     state, model, shapes = simulation.organ_state, simulation.organ_model, simulation.instrument.shapes
     engaged = state.contact_engaged[shapes.shape_tool == tool].any(axis=0).reshape(-1, QUADRATURE_COUNT)
     if not engaged.any():
@@ -293,12 +291,12 @@ def contact_point(simulation: Simulation, tool: int) -> FloatArray:
     triangles, points = np.nonzero(engaged)
     corners = state.node_position[model.surface_triangles[triangles]]
     weights = model.surface_rest_area[triangles]
-    touched = np.einsum("qc,qcx->qx", QUADRATURE_BARYCENTRIC[points], corners)
-    return weights @ touched / weights.sum()
+    places = np.einsum("qc,qcx->qx", QUADRATURE_BARYCENTRIC[points], corners)
+    return weights @ places / weights.sum()
 
 
 def _paint_arrow(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None:
-    """An outlined arrow between two points [pixels] and a label beside its head, into the picture."""
+    """Paint an outlined arrow between two points [pixels] and a label beside its head."""
     from PIL import Image, ImageDraw, ImageFont
 
     scale = frame.shape[0] / 480.0
@@ -306,22 +304,21 @@ def _paint_arrow(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None
     upper = np.minimum(np.ceil(ends.max(axis=0) + ARROW_ROOM[1] * scale), [frame.shape[1], frame.shape[0]]).astype(int)
     if (upper <= lower).any():
         return
-    many = OVERSAMPLING
-    size = (upper - lower) * many
+    size = (upper - lower) * OVERSAMPLING
     layer = Image.new("RGBA", (int(size[0]), int(size[1])), (0, 0, 0, 0))
     draw = ImageDraw.Draw(layer)
-    start, end = (ends - lower) * many
-    outline = _arrow(start, end, scale * many, ARROW_EDGE * scale * many)
+    start, end = (ends - lower) * OVERSAMPLING
+    outline = _arrow(start, end, scale * OVERSAMPLING, ARROW_EDGE * scale * OVERSAMPLING)
     draw.polygon([tuple(point) for point in outline], fill=ARROW_OUTLINE)
-    draw.polygon([tuple(point) for point in _arrow(start, end, scale * many, 0.0)], fill=ARROW_COLOUR)
-    font = ImageFont.load_default(size=max(TEXT_SIZE * scale * many, 1.0))
-    # Beyond the head, to the right of it where the arrow points up or down.
-    place = end + np.array([14.0, 5.0 if end[1] > start[1] else -23.0]) * scale * many
+    draw.polygon([tuple(point) for point in _arrow(start, end, scale * OVERSAMPLING, 0.0)], fill=ARROW_COLOUR)
+    font = ImageFont.load_default(size=max(TEXT_SIZE * scale * OVERSAMPLING, 1.0))
+    # Beyond the head and to the right of it, below or above with the arrow's direction.
+    place = end + np.array([14.0, 5.0 if end[1] > start[1] else -23.0]) * scale * OVERSAMPLING
     box = np.array(draw.textbbox(tuple(place), label, font=font))
-    box += np.array([-5, -4, 5, 4]) * scale * many
-    # Moved back into the picture where it would be cut off.
+    box += np.array([-5, -4, 5, 4]) * scale * OVERSAMPLING
+    # Moved back into the picture if it would be cut off.
     shift = np.maximum(-box[:2], 0.0) + np.minimum(size - box[2:], 0.0)
-    draw.rounded_rectangle((box + np.tile(shift, 2)).tolist(), radius=4 * scale * many, fill=LABEL_BACK)
+    draw.rounded_rectangle((box + np.tile(shift, 2)).tolist(), radius=4 * scale * OVERSAMPLING, fill=LABEL_BACK)
     draw.text(tuple(place + shift), label, font=font, fill=ARROW_COLOUR)
     small = layer.resize(tuple((upper - lower).tolist()), Image.Resampling.BOX)
     part = (slice(lower[1], upper[1]), slice(lower[0], upper[0]))
@@ -330,7 +327,7 @@ def _paint_arrow(frame: NDArray[np.uint8], ends: FloatArray, label: str) -> None
 
 
 def _arrow(start: FloatArray, end: FloatArray, scale: float, edge: float) -> FloatArray:
-    """Corners of an arrow from start to end, made wider by an edge on every side [pixels], shape (7, 2)."""
+    """Corners of an arrow from start to end, wider by an edge on each side [pixels], shape (7, 2)."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length if length > 0.0 else np.array([0.0, -1.0])
     across = np.array([-along[1], along[0]])

@@ -1,4 +1,4 @@
-"""The drawn scene as a MuJoCo model of its own, which is not simulated: organ, sections, instrument, drape, lights."""
+"""Drawn scene as a MuJoCo model of its own, never simulated: organ, sections, instrument, drape, lights."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,20 +22,20 @@ from surgsim_env.scene.palpable_surface import tangent_axes
 Colour = tuple[float, float, float]
 
 
-# Names of an instrument's geoms begin with it.
+# Prefix of the names of an instrument's geoms.
 PREFIX = "instrument"
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 _DRAWN_TYPES = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
     for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 }
-# MuJoCo's default colour of a geom: the colour of its material counts then.
+# MuJoCo's default colour of a geom, replaced by the colour of its material.
 _NO_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class Finish:
-    """Colour (red, green, blue), strength and narrowness of highlights, and light that a material emits."""
+    """Colour (red, green, blue), strength and narrowness of highlights, and emitted light of a material."""
 
     colour: Colour
     specular: float
@@ -43,7 +43,7 @@ class Finish:
     emission: float = 0.0
 
 
-# The organ, where it is held by ligaments or a tray, its cut faces, and its shadow on the drape.
+# The organ, its part held by ligaments or a tray, its cut faces, and its shadow on the drape.
 FINISHES = {
     "organ": Finish((0.455, 0.130, 0.100), 0.75, 0.80),
     "held": Finish((0.560, 0.235, 0.185), 0.60, 0.45),
@@ -53,24 +53,24 @@ FINISHES = {
 }
 LESION_COLOUR = (0.98, 0.84, 0.42)
 TARGET_COLOUR = (0.20, 0.75, 0.35)
-# Width of the drape's squares [m], which serve as a scale.
+# Width of the drape's squares [m], a scale for the eye.
 DRAPE_SQUARE = 0.02
 DRAPE_COLOURS = (0.115, 0.315, 0.355), (0.128, 0.345, 0.385)
 BACKGROUND_COLOUR = (0.045, 0.105, 0.120)
-# Half the drape's width in radii of the organ, and its distance below it [m].
+# Half the drape's width in radii of the organ, and its distance below the organ [m].
 DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
 # Name of the texture of vessels, white until a look draws them.
 VESSELS = "vessels"
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
-# MuJoCo accepts no empty or flat mesh: until the first picture a mesh consists of copies of this tetrahedron.
+# MuJoCo accepts no empty or flat mesh: before the first picture a mesh consists of copies of this tetrahedron.
 _TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.01]])
 _TETRAHEDRON_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
 
 
 class DrawnMesh:
-    """One mesh of a compiled model, which can be changed and uploaded."""
+    """Mesh of a compiled model with a new shape for each picture."""
 
     def __init__(self, model: mujoco.MjModel, name: str) -> None:
         self._model = model
@@ -79,7 +79,7 @@ class DrawnMesh:
         self._face_count = int(model.mesh_facenum[self.mesh])
 
     def upload(self, shape: Shape, context: mujoco.MjrContext) -> None:
-        """Replace the shape of the mesh; the geom's frame is the world's."""
+        """Replace the shape of the mesh, in the world's axes."""
         model, mesh, count = self._model, self.mesh, len(shape.vertices)
         for array, address, values in (
             (model.mesh_vert, model.mesh_vertadr, shape.vertices),
@@ -95,18 +95,18 @@ class DrawnMesh:
         self.show(True, context)
 
     def show(self, shown: bool, context: mujoco.MjrContext) -> None:
-        """Hide the mesh from the next picture, or show it again."""
+        """Show the mesh in the next pictures, or hide it."""
         self._model.mesh_facenum[self.mesh] = self._face_count if shown else 0
         mujoco.mjr_uploadMesh(self._model, context, self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
 class InstrumentGeoms:
-    """Geoms of an instrument's model that are drawn, and their geoms in the drawn scene.
+    """Drawn geoms of an instrument's model and their copies in the drawn scene.
 
     Fields:
-        source: geoms of the instrument's model                                     (n_geom,)
-        target: geoms of the drawn scene                                            (n_geom,)
+        source: ids in the instrument's model                                       (n_geom,)
+        target: ids in the drawn scene                                              (n_geom,)
     """
 
     source: np.ndarray
@@ -120,15 +120,15 @@ class InstrumentGeoms:
 
 @dataclass(frozen=True, eq=False)
 class SceneModel:
-    """The compiled scene and its parts.
+    """Compiled scene and its parts.
 
     Fields:
         model, data: MuJoCo's
-        meshes: the meshes that change with each picture, by name, a key of FINISHES
-        instrument: the geoms that follow the instrument
+        meshes: of tissue and shadow, by their names in FINISHES
+        instrument: geoms of the instrument
         light: unit direction of the lamp's light                                   (3,)
         ground: a point of the drape [m]                                            (3,)
-        downward: unit direction in which instruments come                          (3,)
+        downward: unit direction of the instruments' approach                       (3,)
     """
 
     model: mujoco.MjModel
@@ -143,7 +143,7 @@ class SceneModel:
 def build_scene(
     anatomy: Anatomy, surface: DrawnSurface | EmbeddedSurface, instrument: mujoco.MjModel, options: RenderOptions
 ) -> SceneModel:
-    """The scene of an anatomy and an instrument's model, with room for the meshes that the options need."""
+    """Scene of an anatomy and an instrument's model, with the meshes needed by the options."""
     spec = empty_scene(options.width, options.height, BACKGROUND_COLOUR, samples=4 if options.smooth_edges else 0)
     light = add_lights(spec, anatomy.downward)
     ground = _add_drape(spec, anatomy)
@@ -162,13 +162,13 @@ def build_scene(
 
 
 def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4, far: float = FAR) -> mujoco.MjSpec:
-    """A scene with a camera and nothing to see before a background; `far` is the far clipping plane [m]."""
+    """Scene with a camera and a background alone; `far` is the far clipping plane [m]."""
     spec = mujoco.MjSpec()
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     spec.visual.quality.offsamples = samples
     spec.stat.extent = 1.0
     spec.visual.map.znear, spec.visual.map.zfar = NEAR, far
-    # Where a camera sees beyond everything else.
+    # Visible beyond all geoms.
     sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=16, height=96)
     sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
     sky.rgb1 = sky.rgb2 = background
@@ -184,9 +184,9 @@ def add_tissue(
     opacity: float = 1.0,
     texture_places: NDArray[np.float32] | None = None,
 ) -> None:
-    """Add a mesh with the finish of its name, with room for `vertex_count` vertices and `face_count` triangles.
+    """Add a mesh with the finish of its name, with space for `vertex_count` vertices and `face_count` triangles.
 
-    With places on a texture (n_place, 2) its triangles can be textured.
+    Texture places (n_place, 2) let its triangles be textured.
     """
     finish = FINISHES[name]
     material = spec.add_material(name=name, specular=finish.specular, shininess=finish.shininess)
@@ -211,7 +211,7 @@ def add_tissue(
 def compile_scene(
     spec: mujoco.MjSpec, meshes: Iterable[str]
 ) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, DrawnMesh]]:
-    """The compiled scene, its data, and its meshes by name, whose vertices are in the world's axes."""
+    """Compile a scene: its model, its data, and its meshes by name, in the world's axes."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -226,9 +226,9 @@ def compile_scene(
 def _room(
     anatomy: Anatomy, surface: DrawnSurface | EmbeddedSurface, options: RenderOptions
 ) -> dict[str, tuple[int, int]]:
-    """Largest number of vertices and of triangles of each mesh of the scene."""
-    many = 2 if options.cut_away else 1
-    whole = many * surface.vertex_count, many * len(surface.faces)
+    """Largest number of vertices and of triangles of each mesh in the scene."""
+    copies = 2 if options.cut_away else 1
+    whole = copies * surface.vertex_count, copies * len(surface.faces)
     room = {"organ": whole, "held": whole}
     if options.cut_away:
         # A tet is cut in a quadrangle at most; its triangles are split, and a lesion's outline may divide each of them.
@@ -241,7 +241,7 @@ def _room(
 
 
 def add_lights(spec: mujoco.MjSpec, down: FloatArray) -> FloatArray:
-    """A lamp above the surgeon's left shoulder, a faint one from behind, one at the camera; the lamp's direction."""
+    """Add a lamp above the surgeon's left shoulder, a faint one behind and one at the camera; the lamp's direction."""
     up = -down
     across, along = tangent_axes(down)
     directions = {"lamp": (0.30 * along + 0.38 * across - up, 0.60), "rim": (-along - 0.4 * across - 0.5 * up, 0.22)}
@@ -258,7 +258,7 @@ def add_lights(spec: mujoco.MjSpec, down: FloatArray) -> FloatArray:
 
 
 def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
-    """A cloth below the organ and its supports; returns a point of it [m].
+    """Add a cloth below the organ and its supports; returns a point of it [m].
 
     A plane that supports the organ replaces it.
     """
@@ -273,7 +273,7 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
     mujoco.mju_mat2Quat(quaternion, np.column_stack([across, np.cross(-down, across), -down]).ravel())
     cloth = spec.add_texture(name="drape", type=mujoco.mjtTexture.mjTEXTURE_2D, width=64, height=64)
     cloth.builtin = mujoco.mjtBuiltin.mjBUILTIN_CHECKER
-    # Relative to the lighter squares, whose colour is the material's.
+    # Relative to the lighter squares: they have the material's colour.
     cloth.rgb1, cloth.rgb2 = np.divide(DRAPE_COLOURS, DRAPE_COLOURS[1])
     material = spec.add_material(name="drape", specular=0.0, shininess=0.0)
     material.rgba = [*DRAPE_COLOURS[1], 1.0]
@@ -296,7 +296,7 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
 
 
 def shown_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms to draw: the visible ones (groups 0 to 2), and contact geoms of bodies without a visible mesh."""
+    """Geoms to be drawn: groups 0 to 2, and contact geoms of bodies without a visible mesh."""
     shown = []
     is_mesh = model.geom_type == _MESH
     dressed = set(model.geom_bodyid[is_mesh & (model.geom_group < CONTACT_GROUP)].tolist())
@@ -310,7 +310,7 @@ def shown_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def add_instrument(spec: mujoco.MjSpec, model: mujoco.MjModel, prefix: str = PREFIX) -> None:
-    """Add every geom that is shown, and the meshes and materials of these; names in the scene begin with `prefix`."""
+    """Add the shown geoms of a model with their meshes and materials; names in the scene begin with `prefix`."""
     for geom in shown_geoms(model):
         kind = int(model.geom_type[geom])
         added = spec.worldbody.add_geom(
@@ -330,7 +330,7 @@ def add_instrument(spec: mujoco.MjSpec, model: mujoco.MjModel, prefix: str = PRE
 
 
 def find_instrument(drawn: mujoco.MjModel, model: mujoco.MjModel, prefix: str = PREFIX) -> InstrumentGeoms:
-    """The geoms that `add_instrument` added, in the compiled scene; their meshes get the instrument's own frames."""
+    """Geoms of `add_instrument` in the compiled scene; their meshes get the instrument's own frames."""
     source = shown_geoms(model)
     for mesh in {int(model.geom_dataid[geom]) for geom in source if model.geom_type[geom] == _MESH}:
         target = drawn.mesh(f"{prefix}_mesh_{mesh}").id
@@ -343,19 +343,19 @@ def find_instrument(drawn: mujoco.MjModel, model: mujoco.MjModel, prefix: str = 
 
 
 def is_support(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom is a support of the organ."""
+    """True if a geom is a support of the organ."""
     body = int(model.geom_bodyid[geom])
     in_world = body == 0 or model.body_mocapid[body] >= 0
     return in_world and model.geom(geom).name.startswith(SUPPORT_PREFIX)
 
 
 def _name(model: mujoco.MjModel, geom: int, prefix: str) -> str:
-    """A geom's name in the drawn scene: what begins with PREFIX is labelled as the instrument, supports are not."""
+    """Name of a geom in the drawn scene; PREFIX labels it as the instrument, supports have another."""
     return f"{SUPPORT_PREFIX if is_support(model, geom) else f'{prefix}_'}{geom}"
 
 
 def _cloth(spec: mujoco.MjSpec) -> str:
-    """The material of supports, which is matt."""
+    """Matt material of supports."""
     name = f"{SUPPORT_PREFIX}material"
     if spec.material(name) is None:
         spec.add_material(name=name, specular=0.0, shininess=0.0)
@@ -363,7 +363,7 @@ def _cloth(spec: mujoco.MjSpec) -> str:
 
 
 def geom_colour(model: mujoco.MjModel, geom: int) -> FloatArray:
-    """Red, green, blue and opacity of a geom, its material's where it has none of its own, shape (4,)."""
+    """Red, green, blue and opacity of a geom, its material's if it has none of its own, shape (4,)."""
     colour, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     if material >= 0 and np.array_equal(colour, _NO_COLOUR):
         colour = model.mat_rgba[material]
@@ -371,7 +371,7 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> FloatArray:
 
 
 def _material(spec: mujoco.MjSpec, model: mujoco.MjModel, material: int, prefix: str) -> str:
-    """A material like the instrument's own; polished metal where it has none."""
+    """Material like the instrument's own; polished metal if it has none."""
     name = f"{prefix}_material_{material}"
     if spec.material(name) is None:
         added = spec.add_material(name=name, specular=0.9, shininess=0.7)
@@ -395,7 +395,7 @@ def _mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int, prefix: str) ->
     return name
 
 
-def mesh_rows(model: mujoco.MjModel, mesh: int, what: str) -> NDArray[Any]:
-    """The rows of one mesh in mesh_vert, mesh_normal or mesh_face, shape (n, 3)."""
-    first = int(getattr(model, f"mesh_{what}adr")[mesh])
-    return getattr(model, f"mesh_{what}")[first : first + int(getattr(model, f"mesh_{what}num")[mesh])]
+def mesh_rows(model: mujoco.MjModel, mesh: int, kind: str) -> NDArray[Any]:
+    """Rows of one mesh in mesh_vert, mesh_normal or mesh_face (kind "vert", "normal", "face"), shape (n, 3)."""
+    first = int(getattr(model, f"mesh_{kind}adr")[mesh])
+    return getattr(model, f"mesh_{kind}")[first : first + int(getattr(model, f"mesh_{kind}num")[mesh])]

@@ -1,7 +1,4 @@
-"""A scene loaded into a graphics context: uploads what moves, draws colour, depth and labels; shared by its users.
-
-Its MuJoCo model is not simulated.
-"""
+"""Scene in a graphics context: upload of moving shapes, drawing of colour, depth and labels."""
 
 import atexit
 import contextlib
@@ -33,18 +30,18 @@ LOCK = threading.RLock()
 LABELS = {"background": 0, "organ": 1, "instrument": 2, "lesion": 3, "target": 4}
 # Labels of the scene's meshes.
 MESH_LABELS = dict.fromkeys(("organ", "held", "section"), LABELS["organ"]) | {"section_lesion": LABELS["lesion"]}
-# Largest number of lesions in a picture; they and a target are geoms that the model does not have.
+# Largest number of lesions in a picture; they and a target are geoms beyond the model's.
 LESIONS_MOST = 100
-# A picture has at most one triangle of the organ for so many pixels; a small one then takes half the time.
+# Pixels for each triangle of the organ, at least: halves the time of small pictures.
 PIXELS_OF_TRIANGLE = 4
-# A target is drawn this thick [m], all of it below the disc itself.
+# Thickness of a drawn target [m], all of it below the disc itself.
 TARGET_THICKNESS = 2e-4
 
 _stages: dict[tuple, "Stage"] = {}
 
 
 class Canvas:
-    """A model in a graphics context, seen by its only camera.
+    """Model in a graphics context, seen by its only camera.
 
     Fields:
         context: MuJoCo's, with the model's meshes
@@ -52,7 +49,7 @@ class Canvas:
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, gl_context: Any, *, more_geoms: int = 0) -> None:
-        """Load a model; pictures are as large as its off-screen buffer and may have `more_geoms` than it.
+        """Load a model; pictures have the size of its off-screen buffer and up to `more_geoms` further geoms.
 
         Raises:
             NoGLError: MuJoCo cannot draw with this context.
@@ -77,27 +74,27 @@ class Canvas:
         self._rect = mujoco.MjrRect(0, 0, size.offwidth, size.offheight)
 
     def select(self) -> None:
-        """Draw off screen from now on; to be called before meshes are uploaded."""
+        """Draw off screen from now on; call before uploading meshes."""
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
 
     def look(self, camera: Camera, *, sky: bool = True) -> None:
-        """Take the geoms as they are now, seen by a camera; without the sky a picture is quicker to draw."""
+        """Take the current geoms, seen by a camera; without the sky drawing is faster."""
         data = self._data
         data.cam_xpos[0], data.cam_xmat[0] = camera.position, camera.rotation.ravel()
         self._model.cam_fovy[0] = camera.fov
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._visible, None, self._camera, everything, self.drawn)
+        categories = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._visible, None, self._camera, categories, self.drawn)
         self.drawn.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
 
     def colour(self) -> NDArray[np.uint8]:
-        """The picture, shape (height, width, 3), its first row on top."""
+        """Picture, shape (height, width, 3), its first row on top."""
         frame = np.empty((self._rect.height, self._rect.width, 3), dtype=np.uint8)
         mujoco.mjr_render(self._rect, self.drawn, self.context)
         mujoco.mjr_readPixels(frame, None, self._rect, self.context)
         return np.ascontiguousarray(frame[::-1])
 
     def numbers(self) -> NDArray[np.int32]:
-        """The number of the geom (its `segid`) that each pixel shows, plus 1, 0 for none, shape (height, width)."""
+        """Number of the geom at each pixel (its `segid` plus 1, 0 for none), shape (height, width)."""
         with self._numbered():
             frame = self.colour()
         return frame.astype(np.int32) @ np.array([1, 256, 65536], dtype=np.int32)
@@ -111,42 +108,39 @@ class Canvas:
         return depth[::-1]
 
     def present(self, frame: NDArray[np.uint8]) -> None:
-        """Copy a picture to the window that the context belongs to."""
+        """Copy a picture to the context's window."""
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_WINDOW.value, self.context)
         mujoco.mjr_drawPixels(np.ascontiguousarray(frame[::-1]).ravel(), None, self._rect, self.context)
 
     def close(self) -> None:
-        """Free what the graphics context holds."""
+        """Free the graphics context's memory."""
         self.gl_context.make_current()
         self.context.free()
 
     @contextlib.contextmanager
     def _numbered(self) -> Iterator[None]:
-        """Draw geoms in the colour of their number within this block."""
-        self._number_colours(True)
+        """Draw each geom in the colour of its number within the block."""
+        segment, number = mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR
+        self.drawn.flags[segment] = self.drawn.flags[number] = True
         try:
             yield
         finally:
-            self._number_colours(False)
-
-    def _number_colours(self, on: bool) -> None:
-        self.drawn.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = on
-        self.drawn.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = on
+            self.drawn.flags[segment] = self.drawn.flags[number] = False
 
 
 class Stage:
-    """The drawn scene of an anatomy, loaded into a graphics context."""
+    """Drawn scene of an anatomy in a graphics context."""
 
     def __init__(self, anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> None:
-        """Make the scene and load it into a context."""
+        """Compile the scene and load it into a context."""
         self.users = 0
-        # A section is of tets: in a cut-open view their boundary is drawn, which meets it.
+        # A section cuts tets, so a cut-open view draws their boundary: the two meet.
         most = min(TRIANGLES_MOST, options.width * options.height // PIXELS_OF_TRIANGLE)
         self.surface = boundary_surface(anatomy, most) if options.cut_away else organ_surface(anatomy, most)
         self.scene = build_scene(anatomy, self.surface, instrument, options)
         self.canvas = Canvas(self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1)
         self._look = DrawnLook(self.scene, self.canvas.context, has_vessels=not options.cut_away)
-        # Labels of geoms that a picture has beyond those of the model, by their places in it.
+        # Labels of geoms beyond the model's, by their numbers in the picture.
         self._added: dict[int, int] = {}
 
     def show(
@@ -158,14 +152,14 @@ class Stage:
         target: Disc | None,
         look: Look | None = None,
     ) -> None:
-        """Upload the shapes and poses of a picture and look at them through a camera.
+        """Upload the shapes and poses of a picture and aim its camera.
 
         Args:
             camera: of the picture.
             shapes: surface and cut faces by their names in the scene.
-            instrument: the instrument's data, which is read.
-            lesions: centre [m] (3,), half axes [m] (3,) of each solid lesion.
-            target: a disc to be drawn, None for none.
+            instrument: the instrument's data, read only.
+            lesions: centre [m] (3,) and half axes [m] (3,) of each solid lesion.
+            target: a disc, None for none.
             look: of the picture; None: the scene's own.
         """
         self._look.put_on(look)
@@ -183,14 +177,14 @@ class Stage:
             self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, target.rotation, self._look.target_colour, "target")
 
     def depth(self) -> NDArray[np.float32]:
-        """Distance from the camera's plane [m], infinite where there is nothing, shape (height, width)."""
+        """Distance from the camera's plane [m], infinite for background, shape (height, width)."""
         # 1 / z is linear in the reversed depth.
         raw = self.canvas.depth().astype(np.float64)
         inverse = 1.0 / FAR + raw * (1.0 / NEAR - 1.0 / FAR)
         return np.where(raw > 0.0, 1.0 / inverse, np.inf).astype(np.float32)
 
     def labels(self) -> NDArray[np.uint8]:
-        """Label of each pixel, by LABELS; solid lesions are labelled also through the organ, shape (height, width)."""
+        """Label of each pixel by LABELS, solid lesions also through the organ, shape (height, width)."""
         shown = self._labels()
         if LABELS["lesion"] in self._added.values():
             organ = [self.scene.meshes[name] for name in ("organ", "held")]
@@ -220,7 +214,7 @@ class Stage:
         self, kind: mujoco.mjtGeom, size: FloatArray, centre: FloatArray, rotation: FloatArray,
         colour: tuple[float, float, float], label: str,
     ) -> None:  # fmt: skip
-        """Add a geom to the drawn scene that its model does not have."""
+        """Add a geom beyond the model's to the picture."""
         drawn = self.canvas.drawn
         geom = drawn.geoms[drawn.ngeom]
         mujoco.mjv_initGeom(geom, kind, size, centre, rotation.ravel(), np.array([*colour, 1.0], dtype=np.float32))
@@ -233,7 +227,7 @@ class Stage:
 
 
 def borrow_stage(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> Stage:
-    """The stage that all simulations of one anatomy share, for pictures of one size and kind; return it when done."""
+    """Stage shared by the simulations of one anatomy, for pictures of one size and kind; return it when done."""
     drawn = replace(options, camera="overview", show_force=True)
     key = anatomy, int(instrument.signature), drawn, id(gl_context)
     with LOCK:
@@ -249,14 +243,14 @@ def give_back_stage(stage: Stage) -> None:
     with LOCK:
         stage.users -= 1
         if stage.users == 0:
-            for key in [key for key, one in _stages.items() if one is stage]:
+            for key in [key for key, kept in _stages.items() if kept is stage]:
                 del _stages[key]
                 stage.canvas.close()
 
 
 @cache
 def _close_all_at_exit() -> None:
-    """Registered with the first stage, so that it runs while OpenGL is still loaded."""
+    """Register `_close_all` with the first stage, so that it runs while OpenGL is still loaded."""
     atexit.register(_close_all)
 
 

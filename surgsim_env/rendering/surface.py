@@ -1,4 +1,4 @@
-"""The drawn surface of an organ: sharp creases, triangles split and bent, smooth normals."""
+"""Drawn surface of an organ: sharp creases, triangles split and bent, smooth normals."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from scipy.sparse.csgraph import connected_components
 from msdm_core.mesh.surface import triangle_lattice
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
-# Neighbours whose resting normals differ by more than this meet at a crease, as the faces of a block do [degrees].
+# Angle between resting normals beyond which neighbours meet at a crease, as the faces of a block do [degrees].
 CREASE_ANGLE = 50.0
-# Each triangle is drawn as splits^2 smaller ones, with the largest splits that stay below this number of triangles.
+# Each triangle is drawn as splits^2 smaller ones; `splits` is the largest up to SPLITS_MOST within TRIANGLES_MOST.
 TRIANGLES_MOST = 15_000
 SPLITS_MOST = 4
 # Share by which small triangles are bent towards the tangent planes of their corners (Boubekeur & Alexa 2008).
 BEND = 0.6
-# No vertex leaves its flat triangle, which the simulation touches, by more than this [m].
+# Largest distance of a vertex from its flat triangle, which the simulation touches [m].
 BEND_MOST = 0.0008
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The shape of a mesh in one picture, in the world's axes.
+    """Shape of a mesh in one picture, in the world's axes.
 
     Fields:
         vertices: [m]                                                               (n_vertex, 3)
@@ -40,7 +40,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """Small triangles over a closed surface, whose vertices and normals follow the nodes.
+    """Smoothed triangles over a closed surface; vertices and normals follow the nodes.
 
     A corner is a node, once for each of the smooth parts of the surface that meet there. With w a vertex's weights of
     corners, x and n their positions and normals, a vertex is drawn at
@@ -53,7 +53,7 @@ class DrawnSurface:
         weights: of the corners at each vertex                                      (n_vertex, n_corner)
         bend: BEND, but 0 where bending would open a crease                         (n_vertex, 1)
         faces: vertices of the small triangles, outward, `splits`^2 for each triangle in turn   (n_face, 3)
-        splits: into how many parts each edge is split                              scalar
+        splits: number of parts of each edge                                        scalar
     """
 
     corner_node: IntArray
@@ -66,7 +66,7 @@ class DrawnSurface:
 
     @property
     def vertex_count(self) -> int:
-        """Number of vertices that are drawn."""
+        """Number of drawn vertices."""
         return len(self.bend)
 
     def follow(self, node_position: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -88,12 +88,12 @@ class DrawnSurface:
         return self.weights @ values[self.corner_node]
 
     def faces_among(self, nodes: IntArray) -> NDArray[np.bool_]:
-        """Which small triangles are of a triangle whose nodes are all among some, (n_face,)."""
+        """True for small triangles of a triangle with all its nodes among `nodes`, shape (n_face,)."""
         return np.repeat(np.isin(self.triangles, nodes).all(axis=1), self.splits**2)
 
 
 def drawn_surface(points: FloatArray, triangles: IntArray, triangles_most: int = TRIANGLES_MOST) -> DrawnSurface:
-    """The drawn surface of a closed one.
+    """Smooth and split a closed surface for drawing.
 
     Args:
         points: node positions at rest [m], (n_node, 3).
@@ -117,7 +117,7 @@ def drawn_surface(points: FloatArray, triangles: IntArray, triangles_most: int =
 
 
 def smooth_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals of a surface's vertices (n_vertex, 3), the mean over its triangles by area, shape (n_vertex, 3)."""
+    """Unit normals of a surface's vertices, means over its triangles weighted by area, shape (n_vertex, 3)."""
     corners = vertices[faces]
     area_vector = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     at, weight = faces.ravel(), np.repeat(area_vector, 3, axis=0)
@@ -129,19 +129,22 @@ def _unit(vectors: np.ndarray) -> FloatArray:
 
 
 def _corners(points: FloatArray, triangles: IntArray) -> tuple[IntArray, IntArray]:
-    """Which corner each triangle's corner is (n_triangle, 3), and each corner's node: split where creases meet."""
+    """Corners of the triangles (n_triangle, 3) and their nodes (n_corner,); a node on a crease has several corners."""
     position = points[triangles]
     normal = _unit(np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]))
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     face = np.repeat(np.arange(len(triangles)), 3)
-    here = np.arange(triangles.size)
-    there = here.reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    start_at = np.arange(triangles.size)
+    end_at = start_at.reshape(-1, 3)[:, [1, 2, 0]].ravel()
     # An edge's two half edges are neighbours after sorting by its nodes.
     order = np.lexsort((np.maximum(start, end), np.minimum(start, end))).reshape(-1, 2)
-    one, other = order[:, 0], order[:, 1]
-    smooth = (normal[face[one]] * normal[face[other]]).sum(axis=1) >= np.cos(np.radians(CREASE_ANGLE))
-    one, other = one[smooth], other[smooth]
-    rows, columns = np.concatenate([here[one], there[one]]), np.concatenate([there[other], here[other]])
+    edge, opposite = order[:, 0], order[:, 1]
+    smooth = (normal[face[edge]] * normal[face[opposite]]).sum(axis=1) >= np.cos(np.radians(CREASE_ANGLE))
+    edge, opposite = edge[smooth], opposite[smooth]
+    rows, columns = (
+        np.concatenate([start_at[edge], end_at[edge]]),
+        np.concatenate([end_at[opposite], start_at[opposite]]),
+    )
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(triangles.size, triangles.size))
     count, corner = connected_components(graph, directed=False)
     corner_node = np.empty(count, dtype=np.int32)
@@ -150,7 +153,7 @@ def _corners(points: FloatArray, triangles: IntArray) -> tuple[IntArray, IntArra
 
 
 def _split(corner_of: IntArray, corner_count: int, splits: int) -> tuple[csr_array, IntArray]:
-    """Each vertex's weights of corners, and the small triangles; neighbours share the vertices of their edge."""
+    """Weights of the corners at each vertex, and the small triangles; neighbours share the vertices of their edge."""
     lattice, small = triangle_lattice(splits)
     corners = np.repeat(corner_of[:, None, :], len(lattice), axis=1).reshape(-1, 3)
     counts = np.tile(lattice, (len(corner_of), 1))
@@ -166,13 +169,13 @@ def _split(corner_of: IntArray, corner_count: int, splits: int) -> tuple[csr_arr
 
 
 def _seam_vertices(corner_of: IntArray, weights: csr_array) -> np.ndarray:
-    """Vertices that lie within an edge of which each side has its own corners, as the edges of a block have."""
+    """Vertices inside crease edges, where the two sides have separate corners, as on a block."""
     pairs = np.sort(corner_of[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique, uses = np.unique(pairs, axis=0, return_counts=True)
     seams = {tuple(pair) for pair in unique[uses == 1].tolist()}
     starts, columns = weights.indptr, weights.indices
-    found = np.zeros(len(starts) - 1, dtype=bool)
+    on_seam = np.zeros(len(starts) - 1, dtype=bool)
     for vertex in np.flatnonzero(np.diff(starts) == 2):
         a, b = columns[starts[vertex]], columns[starts[vertex] + 1]
-        found[vertex] = (min(a, b), max(a, b)) in seams
-    return found
+        on_seam[vertex] = (min(a, b), max(a, b)) in seams
+    return on_seam

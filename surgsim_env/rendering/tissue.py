@@ -1,6 +1,6 @@
-"""Shapes of an organ and its lesions for a picture: drawn surface, cut-away section, lesions that move with it.
+"""Shapes of an organ and its lesions for a picture: drawn surface, cut-away section, moving lesions.
 
-Meshes are cut by a plane at rest: the rest of a surface, and the section through tets; vertices are mixes of nodes.
+Meshes are cut by a plane at rest; vertices of cuts are linear combinations of nodes, here called a mix.
 """
 
 from collections.abc import Sequence
@@ -18,25 +18,25 @@ from surgsim_env.rendering.surface import DrawnSurface, Shape, smooth_normals
 from surgsim_env.rendering.vessels import texture_places
 from surgsim_env.scene.anatomy import Anatomy
 
-# Edges of a section's triangles are split into this number of parts, so that a lesion's outline looks round.
+# Parts of each edge of a section's triangles, for a round outline of lesions.
 SECTION_SPLITS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class LesionBall:
-    """A lesion as an ellipsoid that moves with the tissue inside it: centre [m], half axes [m] and those nodes."""
+    """Lesion as an ellipsoid: centre [m], half axes [m], and the nodes inside, whose mean displacement moves it."""
 
     centre: FloatArray
     half_axes: FloatArray
     nodes: IntArray
 
     def centre_now(self, rest: FloatArray, node_position: FloatArray) -> FloatArray:
-        """The centre moved by the mean displacement of the nodes inside [m], shape (3,)."""
+        """Centre moved by the mean displacement of the nodes inside [m], shape (3,)."""
         return self.centre + (node_position[self.nodes] - rest[self.nodes]).mean(axis=0)
 
 
 class Tissue:
-    """The shapes of an organ with given lesions as functions of its node positions."""
+    """Shapes of an organ with given lesions as functions of its node positions."""
 
     def __init__(
         self, anatomy: Anatomy, surface: DrawnSurface | EmbeddedSurface, lesions: Sequence[Lesion], cut_away: bool
@@ -58,13 +58,13 @@ class Tissue:
             return {name: Shape(vertices, normals, faces, places[name]) for name, faces in self._faces.items()}
         return self._cut.surfaces(vertices, normals) | self._cut.sections(node_position)
 
-    def lesion_centres(self, node_position: FloatArray) -> list[FloatArray]:
-        """Present centres of the lesions [m]."""
-        return [lesion.centre_now(self._rest, node_position) for lesion in self.lesions]
+    def lesion_ellipsoids(self, node_position: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """Current centre [m] (3,) and half axes [m] (3,) of each lesion."""
+        return [(lesion.centre_now(self._rest, node_position), lesion.half_axes) for lesion in self.lesions]
 
 
 class _CutAway:
-    """The cut through an organ: an upright plane through its first lesion, computed at rest, moving with the nodes."""
+    """Cut through an organ: an upright plane through its first lesion at rest, moving with the nodes."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class _CutAway:
             self._sections[name] = csr_array(part @ mix), part_faces
 
     def surfaces(self, vertices: FloatArray, normals: FloatArray) -> dict[str, Shape]:
-        """The part of the drawn surface that the cut leaves."""
+        """Remaining part of the drawn surface."""
         shapes = {}
         for name, (mix, faces) in self._surfaces.items():
             turned = mix @ normals
@@ -96,7 +96,7 @@ class _CutAway:
         return shapes
 
     def sections(self, node_position: FloatArray) -> dict[str, Shape]:
-        """The cut faces of healthy tissue and of lesions."""
+        """Cut faces of healthy tissue and of lesions."""
         shapes = {}
         for name, (mix, faces) in self._sections.items():
             vertices = mix @ node_position
@@ -105,13 +105,13 @@ class _CutAway:
 
 
 def cut_plane(anatomy: Anatomy, lesions: Sequence[LesionBall]) -> tuple[FloatArray, FloatArray]:
-    """A point of the cutting plane [m] and its unit normal, which points to the removed side."""
+    """Point of the cutting plane [m] and its unit normal towards the removed side."""
     face = anatomy.mesh.points[anatomy.face.triangles].mean(axis=(0, 1))
     return (lesions[0].centre if lesions else face), cut_direction(anatomy)
 
 
 def lesion_ball(mesh: TetMesh, lesion: Lesion) -> LesionBall:
-    """A lesion of an organ at rest as an ellipsoid; see `msdm_core.material.regions.lesion_extent`."""
+    """Ellipsoid of a lesion of an organ at rest; see `msdm_core.material.regions.lesion_extent`."""
     centre, half_axes = lesion_extent(mesh, lesion)
     distance = np.linalg.norm((mesh.points - centre) / half_axes, axis=1)
     nodes = np.flatnonzero(distance <= max(1.0, float(distance.min())))
@@ -119,44 +119,47 @@ def lesion_ball(mesh: TetMesh, lesion: Lesion) -> LesionBall:
 
 
 def clip_triangles(faces: IntArray, values: FloatArray) -> tuple[csr_array, IntArray]:
-    """The part of triangles where a function, linear in each, is negative.
+    """Clip triangles to the part with negative values of a piecewise linear function.
 
     Args:
         faces: vertices of the triangles                                    (n_face, 3)
         values: of the function at each vertex                              (n_vertex,)
 
     Returns:
-        The mix of old vertices that each new one is (n_new, n_vertex), and the new triangles, with the old orientation.
+        Mix of old vertices for each new one (n_new, n_vertex), and the new triangles, with the old orientation.
     """
     inside = values[faces] < 0.0
     count = inside.sum(axis=1)
     whole = faces[count == 3]
-    # Rotated so that the only corner inside (or outside) comes first.
-    one = _turned(faces[count == 1], inside[count == 1])
-    two = _turned(faces[count == 2], ~inside[count == 2])
-    cut = np.stack([one[:, [0, 1]], one[:, [0, 2]]], axis=1), np.stack([two[:, [0, 1]], two[:, [0, 2]]], axis=1)
+    # Rotated: the only corner inside (or outside) comes first.
+    single = _turned(faces[count == 1], inside[count == 1])
+    double = _turned(faces[count == 2], ~inside[count == 2])
+    cut = (
+        np.stack([single[:, [0, 1]], single[:, [0, 2]]], axis=1),
+        np.stack([double[:, [0, 1]], double[:, [0, 2]]], axis=1),
+    )
     pairs = np.concatenate([part.reshape(-1, 2) for part in cut])
     mix = _with_cut_points(pairs, values)
-    first = len(values) + np.arange(len(one)) * 2
-    second = len(values) + 2 * len(one) + np.arange(len(two)) * 2
+    first = len(values) + np.arange(len(single)) * 2
+    second = len(values) + 2 * len(single) + np.arange(len(double)) * 2
     triangles = [
         whole,
-        np.column_stack([one[:, 0], first, first + 1]),
-        np.column_stack([second, two[:, 1], two[:, 2]]),
-        np.column_stack([second, two[:, 2], second + 1]),
+        np.column_stack([single[:, 0], first, first + 1]),
+        np.column_stack([second, double[:, 1], double[:, 2]]),
+        np.column_stack([second, double[:, 2], second + 1]),
     ]
     return _without_unused(mix, np.concatenate(triangles))
 
 
 def cut_tets(mesh: TetMesh, values: FloatArray) -> tuple[csr_array, IntArray]:
-    """The section of tets by the plane where a linear function of the resting position is 0.
+    """Section of tets by the zero plane of a linear function of the resting position.
 
     Args:
         mesh: the tets.
         values: of the function at each node                                (n_node,)
 
     Returns:
-        The mix of nodes that each vertex is (n_vertex, n_node), and the triangles, which face positive values.
+        Mix of nodes for each vertex (n_vertex, n_node), and the triangles, which face positive values.
     """
     (_, tri), (_, quad) = cut_edges(mesh.tets, values)
     mix = _with_cut_points(np.concatenate([tri.reshape(-1, 2), quad.reshape(-1, 2)]), values)
@@ -171,11 +174,11 @@ def cut_tets(mesh: TetMesh, values: FloatArray) -> tuple[csr_array, IntArray]:
 
 
 def cut_edges(tets: IntArray, values: FloatArray) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray]]:
-    """The edges of tets on which a function, linear in each tet and given at the nodes (n_node,), is 0.
+    """Edges of tets crossed by the zero surface of a piecewise linear function, given at the nodes (n_node,).
 
     Returns:
-        The tets where it is 0 in a triangle (n,) and the nodes of the three edges (n, 3, 2); those where it is 0 in a
-        quadrangle (m,) and the nodes of the four edges in turn (m, 4, 2). A node at 0 counts as positive.
+        Tets cut in a triangle (n,) and the nodes of the three edges (n, 3, 2); tets cut in a quadrangle (m,) and the
+        nodes of the four edges in turn (m, 4, 2). A node at 0 counts as positive.
     """
     inside = values[tets] < 0.0
     count = inside.sum(axis=1)
@@ -187,7 +190,7 @@ def cut_edges(tets: IntArray, values: FloatArray) -> tuple[tuple[IntArray, IntAr
 
 
 def most_tets_cut(mesh: TetMesh, direction: FloatArray) -> int:
-    """Largest number of tets that a plane across a direction cuts."""
+    """Largest number of tets cut by one plane normal to a direction."""
     height = (mesh.points @ direction)[mesh.tets]
     lower, upper = np.sort(height.min(axis=1)), np.sort(height.max(axis=1))
     begun = np.arange(1, len(lower) + 1)
@@ -195,19 +198,19 @@ def most_tets_cut(mesh: TetMesh, direction: FloatArray) -> int:
 
 
 def _gradient(points: FloatArray, values: FloatArray) -> FloatArray:
-    """The gradient of a linear function given at points, shape (3,)."""
+    """Gradient of a linear function given at points, shape (3,)."""
     centred = points - points.mean(axis=0)
     return np.linalg.lstsq(centred, values - values.mean(), rcond=None)[0]
 
 
 def _turned(faces: IntArray, marked: np.ndarray) -> IntArray:
-    """Triangles with their corners rotated so that the only marked one comes first."""
+    """Triangles with their corners rotated: the only marked one comes first."""
     start = marked.argmax(axis=1)[:, None]
     return np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
 
 
 def _with_cut_points(pairs: IntArray, values: FloatArray) -> csr_array:
-    """All vertices as they are, then the point of each pair's edge where the function is 0."""
+    """Mix for all old vertices, then for the zero of the function on each pair's edge."""
     start, end = values[pairs[:, 0]], values[pairs[:, 1]]
     share = start / (start - end)
     old = np.arange(len(values))
@@ -223,7 +226,7 @@ def _without_unused(mix: csr_array, faces: IntArray) -> tuple[csr_array, IntArra
 
 
 def _split(mix: csr_array, faces: IntArray) -> tuple[csr_array, IntArray]:
-    """Every triangle in SECTION_SPLITS^2, with vertices of their own."""
+    """Split each triangle into SECTION_SPLITS^2, with vertices of their own."""
     lattice, small = triangle_lattice(SECTION_SPLITS)
     rows = np.repeat(np.arange(len(faces) * len(lattice)), 3)
     columns = np.repeat(faces[:, None, :], len(lattice), axis=1).ravel()

@@ -1,4 +1,4 @@
-"""Vessels on tissue: a procedural texture, and where each triangle of a surface lies on it."""
+"""Vessels on tissue: a procedural texture, and the texture coordinates of a surface."""
 
 from functools import lru_cache
 
@@ -9,7 +9,7 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
 # Width of the texture [pixels] and of the piece of surface that it covers [m]; it repeats without a seam.
 TEXTURE_SIZE, TEXTURE_WIDTH = 128, 0.06
-# Share of a vessel's spacing by which the waves that make the pattern differ.
+# Relative bandwidth of the waves of the pattern.
 BANDWIDTH = 0.3
 # Colour of a vessel relative to the tissue's: darker and bluer.
 VESSEL_TINT = np.array([1.0, 1.25, 1.05])
@@ -19,15 +19,15 @@ AXIS_COUNT = 3
 
 @lru_cache(maxsize=64)
 def vessel_texture(seed: int, density: float, strength: float, width: float) -> NDArray[np.uint8]:
-    """A texture (TEXTURE_SIZE, TEXTURE_SIZE, 3) to be multiplied with the tissue's colour.
+    """Texture (TEXTURE_SIZE, TEXTURE_SIZE, 3), a factor on the tissue's colour.
 
-    Vessels lie where a random field of waves of about one length changes its sign.
+    Vessels are the zeros of a random field of waves of about one length.
 
     Args:
         seed: of the field.
         density: vessels crossed on a metre of surface [1/m].
-        strength: how much darker they are, 0 to 1.
-        width: share of the surface that they take, about.
+        strength: darkness, 0 to 1.
+        width: approximate share of the surface.
     """
     rng = np.random.default_rng(seed)
     # A wave of length L changes its sign twice.
@@ -44,15 +44,15 @@ def vessel_texture(seed: int, density: float, strength: float, width: float) -> 
 
 
 def texture_places(vertices: FloatArray, faces: IntArray) -> tuple[NDArray[np.float32], IntArray]:
-    """Where a surface at rest lies on the texture: each triangle is projected along the axis nearest to its normal.
+    """Texture coordinates of a surface at rest; each triangle is projected along the axis nearest to its normal.
 
     Args:
         vertices: at rest [m], (n_vertex, 3).
         faces: vertices of the triangles, (n_face, 3).
 
     Returns:
-        Places of each vertex for the axes x, y and z, one after the other, in widths of the texture
-        (AXIS_COUNT n_vertex, 2), and which of them each triangle's corners have (n_face, 3).
+        Coordinates of each vertex for the axes x, y and z, one after the other, in widths of the texture
+        (AXIS_COUNT n_vertex, 2), and their indices at each triangle's corners (n_face, 3).
     """
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

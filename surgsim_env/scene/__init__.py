@@ -1,4 +1,4 @@
-"""Scenes as data: scene files, arm files, the anatomy of a scene, its palpable surface, levels of difficulty."""
+"""Scenes as data: scene files, arm files, anatomy, palpable surface, levels of difficulty."""
 
 from surgsim_env.scene.anatomy import (
     SUPPORT_TIP_RADII,
@@ -65,7 +65,6 @@ from surgsim_env.scene.palpable_surface import (
     contact_radius,
     hertz_force,
     hidden_share,
-    hidden_text,
     share_text,
     tangent_axes,
     warn_of_coarse_cells,
@@ -116,7 +115,6 @@ __all__ = [
     "fill",
     "hertz_force",
     "hidden_share",
-    "hidden_text",
     "list_materials",
     "list_motions",
     "list_scenes",

@@ -26,27 +26,27 @@ from msdm_core.organ.support import SupportLaw
 from surgsim_env.scene.model import Anchor, LesionDraw, Scene, scaled_step, substeps_needed
 from surgsim_env.scene.palpable_surface import PalpableFace, find_palpable_face, warn_of_coarse_cells
 
-# How exactly a drawn lesion's cover is met [m].
+# Tolerance of a drawn lesion's cover [m].
 COVER_TOLERANCE = 1e-4
-# A press within this many tip radii of a fixed node is dominated by it.
+# Distance from a fixed node, in tip radii, within which the node dominates a press.
 SUPPORT_TIP_RADII = 2.0
 # Largest share of an organ's mass that may be added to save substeps, and the smallest number of substeps.
 ADDED_MASS_SHARE, SUBSTEPS_FEWEST = 0.01, 2
-# Limit of organ substeps in a haptic step: more would take hours.
+# Largest number of organ substeps in a haptic step: more would take hours.
 SUBSTEPS_MOST = 200
-# Cosines are exact to this where it is decided which way a surface faces.
+# Rounding error of the cosine between a surface's normal and a direction.
 SIDE_ROUNDING = 1e-9
 
 
 # Vertices [m] (n_vertex, 3) and outward triangles (n_triangle, 3).
 Surface = tuple[FloatArray, IntArray]
-# Where points of the scene's organ [m] (n, 3) are in a member of its family [m] (n, 3).
+# Map from points of the scene's organ [m] (n, 3) to points of a member of its family [m] (n, 3).
 Deformation = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class MemberName:
-    """A member of a family: its split, one of `model.SPLITS`, and its number in it from 0 on."""
+    """Member of a family: its split, one of `model.SPLITS`, and its number in it from 0 on."""
 
     split: str
     number: int
@@ -57,9 +57,9 @@ class MemberName:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """A scene with its mesh, anchored nodes [n_anchor], palpable face and the elastic foundations that hold it.
+    """Scene with its mesh, anchored nodes (n_anchor,), palpable face and elastic foundations.
 
-    Of a member of a family (`scene.family`) also its name, the scene's own organ and how that was deformed.
+    A member of a family (`scene.family`) also has its name, the scene's own organ and the deformation from that.
     """
 
     scene: Scene
@@ -73,7 +73,7 @@ class Anatomy:
 
     @cached_property
     def fine_surface(self) -> Surface | None:
-        """The scene's fine surface, read when it is first drawn; None for a scene without one.
+        """Fine surface of the scene, read with the first picture; None for a scene without one.
 
         Raises:
             MeshError: the file cannot be read as a surface.
@@ -81,19 +81,19 @@ class Anatomy:
         source = self.scene.mesh.fine_surface
         if source is None:
             return None
-        # Imports trimesh: only where something is drawn.
+        # Imports trimesh, so only for pictures.
         from msdm_core.mesh_files.surface_io import read_surface
 
         vertices, triangles = read_surface(self.scene.folder / source.file, length_unit=source.length_unit)
         return self._moved(vertices), triangles
 
     def _moved(self, points: FloatArray) -> FloatArray:
-        """Where points of the scene's organ [m] (n, 3) are in this one."""
+        """Points of the scene's organ [m] (n, 3) mapped into this one [m] (n, 3)."""
         return points if self.deformation is None else self.deformation(points)
 
     @cached_property
     def box(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner of a box that contains the organ, and every member of its family [m], (3,) each."""
+        """Lower and upper corner of a box around the organ and all members of its family [m], (3,) each."""
         points, family = (self.template or self).mesh.points, self.scene.family
         lower, upper = points.min(axis=0), points.max(axis=0)
         if family is None:
@@ -103,7 +103,7 @@ class Anatomy:
 
     @property
     def outer_surface(self) -> Surface:
-        """The surface of the organ at rest that pictures show: the fine surface, else the boundary of the tets.
+        """Drawn surface of the organ at rest: the fine surface, else the boundary of the tets.
 
         Raises:
             MeshError: the fine surface cannot be read.
@@ -112,13 +112,13 @@ class Anatomy:
 
     @cached_property
     def ground_motions(self) -> tuple[Motion, ...]:
-        """How a unit of each motion of the scene moves what holds the organ."""
-        return tuple(one.ground(self.mesh.points) for one in self.scene.motions)
+        """Displacement of the organ's ground by a unit of each motion of the scene."""
+        return tuple(motion.ground(self.mesh.points) for motion in self.scene.motions)
 
     @cached_property
     def foundation_nodes(self) -> IntArray:
-        """Surface nodes that an elastic foundation holds (n_held,)."""
-        held = [np.asarray(one.nodes, dtype=np.int32) for one in self.foundations]
+        """Surface nodes on elastic foundations, shape (n_held,)."""
+        held = [np.asarray(foundation.nodes, dtype=np.int32) for foundation in self.foundations]
         return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int32)
 
     @cached_property
@@ -128,19 +128,19 @@ class Anatomy:
 
     @cached_property
     def downward(self) -> FloatArray:
-        """Unit vector that points down in pictures: gravity's direction, or without gravity the approach."""
+        """Unit vector down in pictures: gravity's direction, or without gravity the approach."""
         gravity = np.asarray(self.scene.gravity, dtype=np.float64)
         return gravity / norm(gravity) if gravity.any() else self.face.approach
 
     @cached_property
     def along_surface(self) -> SurfaceDistance:
-        """Distances along the resting surface."""
+        """Geodesic distances on the resting surface."""
         return SurfaceDistance(self.mesh.points, self.mesh.boundary_triangles)
 
     def clear_of_supports(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Whether a press at each of some points [m] (n_point, 3) feels the tissue and not what holds it, (n_point,).
+        """True for points [m] (n_point, 3) far enough from supports for a press to measure tissue, shape (n_point,).
 
-        Fixed nodes are farther than SUPPORT_TIP_RADII; elastic tissue, which yields but covers the surface, than one.
+        Fixed nodes are farther than SUPPORT_TIP_RADII; elastic foundations, which yield, farther than one tip radius.
         """
         tip, nodes = self.scene.instrument.tip_radius, self.mesh.points
         held = ((nodes[self.anchors], SUPPORT_TIP_RADII * tip), (nodes[self.foundation_nodes], tip))
@@ -151,22 +151,22 @@ class Anatomy:
 
     @cached_property
     def _face_supports(self) -> FloatArray:
-        """Nodes of the palpable face that are fixed or that elastic tissue holds [m], (n, 3)."""
+        """Fixed and elastically held nodes of the palpable face [m], shape (n, 3)."""
         held = np.union1d(self.anchors, self.foundation_nodes)
         return self.mesh.points[np.intersect1d(held, self.face.triangles)]
 
     def is_covered(self, point: FloatArray) -> bool:
-        """Whether a ligament or another support covers a point of the palpable face [m] (3,).
+        """True if a ligament or another support covers a point of the palpable face [m] (3,).
 
-        It holds nodes of the face within a tip radius: the tip would press the support, not the tissue.
+        It then holds nodes within a tip radius: the tip would press the support, not the tissue.
         """
         distance = norm(self._face_supports - point, axis=1)
         return bool((distance <= self.scene.instrument.tip_radius).any())
 
     def organ(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganModel:
-        """The organ with given lesions, all moduli of the healthy tissue and its capsule multiplied by a factor.
+        """Compile the organ with lesions, and a factor on all moduli of the healthy tissue and its capsule.
 
-        With the scene's `mass_scaling`, mass is added as its number of substeps needs (`OrganModel.added_mass`).
+        With the scene's `mass_scaling`, mass is added for its number of substeps (`OrganModel.added_mass`).
         """
         if not lesions and modulus_factor == 1.0:
             return self._healthy_organ
@@ -174,21 +174,21 @@ class Anatomy:
 
     @cached_property
     def _healthy_organ(self) -> OrganModel:
-        """Shared by all simulations of the scene: its arrays are read-only, and the stable step takes time to find."""
+        """Organ shared by all simulations of the scene, with read-only arrays; its stable step takes time to find."""
         return self.compiled(self.specification())
 
     def specification(self, lesions: Sequence[Lesion] = (), *, modulus_factor: float = 1.0) -> OrganSpec:
-        """The specification that `organ` compiles, for further changes by an episode's draw."""
+        """Specification of `organ`, for further changes by an episode's draw."""
         scene, capsule = self.scene, self.scene.capsule
         material = _stiffer(scene.material, modulus_factor)
-        standing = [region.as_lesion for region in scene.regions if not region.lesion]
+        regions = [region.as_lesion for region in scene.regions if not region.lesion]
         if capsule is not None:
             capsule = replace(capsule, youngs_modulus=capsule.youngs_modulus * modulus_factor)
         return OrganSpec(
             mesh=self.mesh,
             materials=material,
             capsule=capsule,
-            lesions=(*(replace(one, material=_stiffer(one.material, modulus_factor)) for one in standing), *lesions),
+            lesions=(*(replace(part, material=_stiffer(part.material, modulus_factor)) for part in regions), *lesions),
             anchors=self.anchors,
             foundations=self.foundations,
             damping=scene.damping,
@@ -200,7 +200,7 @@ class Anatomy:
         )
 
     def compiled(self, specification: OrganSpec) -> OrganModel:
-        """The organ of a specification, with mass added as in `organ`."""
+        """Compile a specification, with mass added as in `organ`."""
         organ, timing, law = compile_organ(specification), self.scene.timing, self.scene.contact.law
         if (
             not timing.mass_scaling
@@ -212,18 +212,18 @@ class Anatomy:
     def random_lesion(
         self, rng: np.random.Generator, draw: LesionDraw | None = None, *, modulus_factor: float = 1.0
     ) -> Lesion:
-        """A lesion below a random point of the palpable face.
+        """Draw a lesion below a random point of the palpable face.
 
-        Its cover is the distance from its ball to the organ's surface, to 0.1 mm; a place where no ball of that size
-        has that cover (thin or strongly curved) is drawn again.
+        Its cover is the distance from its ball to the organ's surface, to 0.1 mm; a place without room for ball and
+        cover (thin or strongly curved) is drawn again.
 
         Args:
             rng: source of random numbers.
             draw: its ranges; the scene's by default.
-            modulus_factor: of the tissue around it, to which its modulus ratio refers.
+            modulus_factor: of the tissue around it, the reference of its modulus ratio.
 
         Raises:
-            ValueError: the scene has no [lesion] table, or 200 draws find no room for the lesion.
+            ValueError: the scene has no [lesion] table, or 200 draws give no lesion.
         """
         draw = self.scene.lesion if draw is None else draw
         if draw is None:
@@ -244,19 +244,19 @@ class Anatomy:
     def centres_below(self, points: FloatArray, normals: FloatArray, distance: float) -> FloatArray:
         """Points on the inward normals (n, 3) of points (n, 3) [m] at a distance from the organ's surface [m], (n, 3).
 
-        NaN where there is none, because another side of the organ is near.
+        NaN if there is none, because another side of the organ is near.
         """
         depth = np.full(len(points), distance)
-        centres, sought = np.full((len(points), 3), np.nan), np.arange(len(points))
+        centres, pending = np.full((len(points), 3), np.nan), np.arange(len(points))
         for _ in range(20):
-            tried = points[sought] - normals[sought] * depth[sought, None]
-            gap = distance - self._free_surface.distances(tried)
+            trial = points[pending] - normals[pending] * depth[pending, None]
+            gap = distance - self._free_surface.distances(trial)
             met = np.abs(gap) <= COVER_TOLERANCE
-            centres[sought[met]] = tried[met]
-            depth[sought] += gap
+            centres[pending[met]] = trial[met]
+            depth[pending] += gap
             # A curved surface needs a little more depth; far more means that another side of the organ is near.
-            sought = sought[~met & (np.abs(depth[sought] - distance) <= 0.01)]
-            if not len(sought):
+            pending = pending[~met & (np.abs(depth[pending] - distance) <= 0.01)]
+            if not len(pending):
                 break
         return centres
 
@@ -272,10 +272,10 @@ class Anatomy:
         return NearestTriangle(self.mesh.points[triangles[~held]])
 
     def check_inside(self, lesion: Lesion) -> None:
-        """Refuse a ball that is not inside the organ.
+        """Check that a ball lies inside the organ.
 
         Raises:
-            ValueError: it sticks out, or its centre is outside; says by how much and where.
+            ValueError: it sticks out, or its centre is outside; states the distance and the place.
         """
         if lesion.region is not None or lesion.radius is None:
             return
@@ -303,27 +303,27 @@ class Anatomy:
         return NearestTriangle(self.mesh.points[self.mesh.boundary_triangles])
 
     def lesion_below(self, point: FloatArray, radius: float, cover: float, ratio: float, name: str) -> Lesion:
-        """A sphere whose top lies `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""
+        """Sphere with its top `cover` below a point of the surface [m], `ratio` times as stiff as the tissue."""
         surface_point, normal = self.face.project(point)
         centre = surface_point - normal * (cover + radius)
         return self.lesion_at(centre, radius, ratio, name)
 
     def lesion_at(self, centre: ArrayLike, radius: float, ratio: float, name: str) -> Lesion:
-        """A sphere at a centre [m], `ratio` times as stiff as the tissue."""
+        """Sphere at a centre [m], `ratio` times as stiff as the tissue."""
         return self.lesion_of_modulus(centre, radius, ratio * self.scene.material.youngs_modulus, name)
 
     def lesion_of_modulus(self, centre: ArrayLike, radius: float, youngs_modulus: float, name: str) -> Lesion:
-        """A sphere at a centre [m] with a Young's modulus [Pa], otherwise like the tissue."""
+        """Sphere at a centre [m] with a Young's modulus [Pa], otherwise like the tissue."""
         x, y, z = np.asarray(centre, dtype=np.float64).tolist()
         material = replace(self.scene.material, youngs_modulus=youngs_modulus)
         return Lesion(centre=(x, y, z), radius=radius, material=material, name=name)
 
     def demonstration_lesions(self) -> list[Lesion]:
-        """The lesions of the scene file: regions of its mesh, and balls."""
+        """Lesions of the scene file: regions of its mesh, and balls."""
         lesions = [region.as_lesion for region in self.scene.regions if region.lesion]
-        for one in self.scene.demonstration:
-            below = self._moved(np.array([one.below]))[0]
-            lesions.append(self.lesion_below(below, one.radius, one.cover, one.modulus_ratio, one.name))
+        for ball in self.scene.demonstration:
+            below = self._moved(np.array([ball.below]))[0]
+            lesions.append(self.lesion_below(below, ball.radius, ball.cover, ball.modulus_ratio, ball.name))
         return lesions
 
 
@@ -333,7 +333,7 @@ def _stiffer(material: Material | None, factor: float) -> Material:
 
 
 def load_anatomy(scene: Scene) -> Anatomy:
-    """Mesh a scene's organ and find its anchors and palpable face; the same scene and files give the same object.
+    """Mesh a scene's organ and determine its anchors and palpable face; cached by scene and files.
 
     Warns once if the cells of its palpable face are larger than the contact radius: the mesh would be felt.
     """
@@ -357,14 +357,14 @@ def _load_anatomy(scene: Scene, file_times: tuple[int | None, ...]) -> Anatomy:
 def with_added_mass(
     anatomy: Anatomy, organs_of: Callable[[Anatomy], Iterable[OrganModel]], share_most: float = ADDED_MASS_SHARE
 ) -> Anatomy:
-    """The anatomy with mass scaling and the fewest substeps for which at most a share of each organ's mass is added.
+    """Anatomy with mass scaling and the fewest substeps for an added share of each organ's mass up to `share_most`.
 
     Static forces do not depend on masses: a press that comes to rest measures the same.
 
     Args:
-        anatomy: its number of substeps is the largest that is taken.
-        organs_of: compiles the organs that must be stable, one after the other.
-        share_most: largest share.
+        anatomy: with the largest number of substeps.
+        organs_of: compiles the organs to be stable, one after the other.
+        share_most: largest added mass over an organ's own.
     """
     timing = replace(anatomy.scene.timing, mass_scaling=True)
     for count in range(SUBSTEPS_FEWEST, timing.substep_count):
@@ -373,7 +373,7 @@ def with_added_mass(
             if all(organ.added_mass <= share_most * organ.node_mass.sum() for organ in organs_of(fewer)):
                 return fewer
         except OrganError:
-            # One would need more than the limit of mass scaling.
+            # Needs more than the limit of mass scaling.
             continue
     return replace(anatomy, scene=replace(anatomy.scene, timing=timing))
 
@@ -381,10 +381,10 @@ def with_added_mass(
 def with_substeps(
     anatomy: Anatomy, organs: Sequence[OrganModel], *, least: int = 1, most: float = SUBSTEPS_MOST
 ) -> Anatomy:
-    """The anatomy with the number of substeps, and at least `least`, that is stable for all of some organs in contact.
+    """Anatomy with enough substeps, and at least `least`, for stable contact with each of the organs.
 
     Raises:
-        ValueError: more than `most` are needed.
+        ValueError: more than `most` substeps are needed.
     """
     scene = anatomy.scene
     step = min(stable_dt(organ, scene.contact.law) for organ in organs)
@@ -398,7 +398,7 @@ def with_substeps(
 
 
 def anatomy_of(scene: Scene, mesh: TetMesh) -> Anatomy:
-    """The anatomy of a scene on a given mesh; the scene's own mesh is not read."""
+    """Anatomy of a scene on a given mesh, without reading the scene's own."""
     for region in scene.regions:
         mesh.region_tag(region.name)
     face = find_palpable_face(mesh, scene.instrument.approach, scene.palpation, scene.instrument.tip_radius)
@@ -411,7 +411,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
     if source.block is not None:
         block = source.block
         return box_mesh(block.size, block.cells)
-    # Reading files imports meshio and trimesh: only where a scene needs them.
+    # Imports meshio and trimesh, so only for scenes with files.
     from msdm_core.mesh_files.mesh_io import read_mesh
     from msdm_core.mesh_files.surface_io import read_surface
 
@@ -420,7 +420,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
         vertices, triangles = read_surface(scene.folder / surface.file, length_unit=surface.length_unit)
         if surface.coarse_cell_size is None:
             return mesh_surface(vertices, triangles, cell_size=surface.cell_size)
-        # Fine at the palpable face, coarser in the rest.
+        # Fine at the palpable face, coarser elsewhere.
         return mesh_surface(
             vertices,
             triangles,
@@ -434,7 +434,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
 
 
 def _held(mesh: TetMesh, anchors: Sequence[Anchor]) -> tuple[IntArray, tuple[Foundation, ...]]:
-    """The nodes that anchors fix, and the foundations of those that hold elastically."""
+    """Fixed nodes of the anchors, and the foundations of the elastic ones."""
     fixed: NDArray[np.bool_] = np.zeros(mesh.node_count, dtype=bool)
     on_surface = np.zeros(mesh.node_count, dtype=bool)
     on_surface[mesh.boundary_nodes] = True
@@ -456,7 +456,7 @@ def _held(mesh: TetMesh, anchors: Sequence[Anchor]) -> tuple[IntArray, tuple[Fou
 
 
 def _inside(mesh: TetMesh, anchor: Anchor, on_surface: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Nodes in the place of an anchor, shape (n_node,); of the surface, but in the box of a fixed one all."""
+    """True for nodes held by an anchor, shape (n_node,): surface nodes, or all nodes in the box of a fixed one."""
     if anchor.box is not None:
         within = ((mesh.points >= anchor.box.lower) & (mesh.points <= anchor.box.upper)).all(axis=1)
         return np.asarray(within & on_surface if anchor.is_elastic else within, dtype=np.bool_)

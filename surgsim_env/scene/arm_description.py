@@ -1,4 +1,4 @@
-"""The TOML file that describes an arm beside its MJCF or URDF model: contact geoms, tip, trocar, control."""
+"""Description of an arm in a TOML file beside its MJCF or URDF model: contact geoms, tip, trocar, control."""
 
 import math
 from dataclasses import dataclass, field
@@ -13,14 +13,14 @@ CONTROL_MODES = ("position", "servo")
 
 @dataclass(frozen=True)
 class Tip:
-    """The controlled point of an arm: a site of the model, or a body and an offset in it.
+    """Controlled point of an arm: a site of the model, or a body and an offset in it.
 
     Args:
         site: a site of the model.
-        body: a body of the model, where there are no sites, as in URDF.
+        body: a body of the model, for models without sites, as in URDF.
         offset: of the tip in that body's frame [m].
-        direction: in which the tip points, in the frame of the site or body.
-        ball: the geom (a sphere) whose radius a scene may set.
+        direction: of the tip, in the frame of the site or body.
+        ball: the geom (a sphere) with a radius set by the scene.
     """
 
     site: str | None = None
@@ -37,15 +37,15 @@ class Tip:
 
 @dataclass(frozen=True)
 class Trocar:
-    """The point at which the shaft passes through the body wall.
+    """Passage of the shaft through the body wall.
 
     Args:
-        shaft_body: the body whose straight shaft passes through it.
+        shaft_body: the body with the straight shaft.
         shaft_point: a point of the shaft's axis in that body's frame [m].
         shaft_axis: direction of the shaft's axis in that frame, towards the tip.
         point: the trocar in the model's own world frame [m].
         into: direction into the patient in that frame.
-        fixed: whether the mechanism keeps the shaft there (remote centre of motion); otherwise control does.
+        fixed: True if the mechanism holds the shaft there (remote centre of motion), False if control does.
         tolerance: largest distance of the shaft's axis from the trocar [m], at home, or in all poses with `fixed`.
     """
 
@@ -65,7 +65,7 @@ class Trocar:
 
 @dataclass(frozen=True)
 class JointControl:
-    """How the joints are driven: "position" by the model's own actuators, "servo" by actuators that are added.
+    """Drive of the joints: "position" by the model's own actuators, "servo" by added ones.
 
     Args:
         mode: "position" or "servo".
@@ -73,7 +73,7 @@ class JointControl:
         stiffness: of each added servo [N m/rad or N/m].
         damping: of each added servo [N m s/rad or N s/m].
         effort: largest torque or force of each added servo [N m or N].
-        armature: rotor inertia of each joint with an added servo [kg m^2 or kg]; the model's where none is given.
+        armature: rotor inertia of each joint with an added servo [kg m^2 or kg]; the model's by default.
     """
 
     mode: str
@@ -96,11 +96,11 @@ class JointControl:
 
 @dataclass(frozen=True)
 class AddedShape:
-    """A capsule or a ball that the model file lacks: tissue feels spheres and capsules, not meshes.
+    """Capsule or ball added to the model: tissue contacts spheres and capsules, not meshes.
 
     Args:
-        name: of the geom that is added.
-        body: the body that carries it.
+        name: of the added geom.
+        body: the body with the geom.
         start: end of the capsule's axis, or the middle of the ball, in that body's frame [m].
         radius: [m].
         end: the other end of the capsule's axis [m]; none for a ball.
@@ -115,7 +115,7 @@ class AddedShape:
 
 @dataclass(frozen=True)
 class LinkInertia:
-    """Mass and moments of inertia of a URDF link whose own are missing or not those of a body.
+    """Mass and moments of inertia of a URDF link, in place of missing or unphysical ones.
 
     Args:
         link: its name.
@@ -132,7 +132,7 @@ class LinkInertia:
 
 @dataclass(frozen=True)
 class ArmDescription:
-    """An arm and the instrument it carries.
+    """An arm and its instrument.
 
     Args:
         name: the TOML file's stem.
@@ -146,10 +146,10 @@ class ArmDescription:
         home: value of each joint with the shaft in the trocar [rad or m].
         jaw: joints whose sum is the jaw's opening angle; none for a rigid tip.
         limits: least and largest value of joints [rad or m], in place of the model's.
-        held: joints that do not move and their values [rad or m]; couplings and actuators of theirs are left out.
-        shapes: spheres and capsules that the model file lacks.
+        held: fixed joints and their values [rad or m]; their couplings and actuators are left out.
+        shapes: added spheres and capsules.
         inertias: of links of a URDF file, in place of its own.
-        dropped_meshes: file names of a URDF's meshes that are left out, as the URDF gives them.
+        dropped_meshes: file names of left out meshes of a URDF, as in the URDF.
         description: one line.
     """
 
@@ -208,10 +208,10 @@ class ArmDescription:
 
 
 def read_description(source: str | Path) -> ArmDescription:
-    """The description of a shipped arm's name (see `list_arms`) or of a TOML file's path.
+    """Read a description by a shipped arm's name (see `list_arms`) or a TOML file's path.
 
     Raises:
-        ValueError: an unknown name (lists the known), a file that cannot be read, a missing or wrong entry.
+        ValueError: an unknown name (lists the known ones), an unreadable file, a missing or wrong entry.
     """
     path = Path(source)
     if path.suffix != ".toml":
@@ -221,11 +221,11 @@ def read_description(source: str | Path) -> ArmDescription:
             raise ValueError(f"arm {str(source)!r} is unknown; the arms are {', '.join(known)}{hint}")
         path = scenes_folder() / "instruments" / f"{source}.toml"
     table = read_toml(path, "arm")
-    where = {"name": path.stem, "folder": path.parent}
-    return fill(ArmDescription, {**table, **where}, f"arm {path.stem!r}")
+    place = {"name": path.stem, "folder": path.parent}
+    return fill(ArmDescription, {**table, **place}, f"arm {path.stem!r}")
 
 
-def _require_distinct(what: str, names: tuple[str, ...]) -> None:
+def _require_distinct(entry: str, names: tuple[str, ...]) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{what} name {name!r} twice; each may be named once")
+            raise ValueError(f"{entry} name {name!r} twice; each may be named once")

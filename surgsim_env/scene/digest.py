@@ -1,6 +1,6 @@
-"""Identity of what decides an episode: the version of the physics, and digests of organs and scenes.
+"""Identity of an episode's inputs: the version of the physics, and digests of organs and scenes.
 
-A kept map, a saved state and a score must agree with it.
+A stored map, a saved state and a score must agree with it.
 """
 
 import hashlib
@@ -13,7 +13,7 @@ from msdm_core.mesh.tet_mesh import TetMesh
 from surgsim_env.scene.load import pair_names
 from surgsim_env.scene.model import Scene
 
-# Raised by whoever changes results on purpose; hashes of tests/test_unchanged.py change with it.
+# Increase it with each intended change of results; the hashes of tests/test_unchanged.py change with it.
 PHYSICS_VERSION = 1
 
 
@@ -22,7 +22,7 @@ def content_digest(*parts: object, size: int = 12) -> str:
 
     Args:
         parts: any number.
-        size: bytes of the digest, which is twice as many hexadecimal digits.
+        size: bytes of the digest, two hexadecimal digits each.
     """
     digest = hashlib.blake2b(digest_size=size)
     for part in parts:
@@ -31,7 +31,7 @@ def content_digest(*parts: object, size: int = 12) -> str:
 
 
 def scene_digest(scene: Scene, mesh: TetMesh, *, size: int = 12) -> str:
-    """Digest of a scene and its mesh, wherever its file and its instrument's lie."""
+    """Digest of a scene and its mesh, independent of the folders of its file and its instrument's."""
     names = pair_names(scene.instrument.model) or (scene.instrument.model,)
     instrument = replace(scene.instrument, model=" + ".join(Path(name).name for name in names))
     return content_digest(mesh.points, mesh.tets, replace(scene, folder=Path(), instrument=instrument), size=size)

@@ -26,19 +26,19 @@ from surgsim_env.scene.load import nearest
 from surgsim_env.scene.model import SPLITS, Family
 from surgsim_env.scene.palpable_surface import moved_face, tangent_axes
 
-# The split that an environment plays if none is named.
+# Default split of an environment.
 DEFAULT_SPLIT = "train"
-# Draws of a member until its ranges are too wide.
+# Draws of a member before its ranges count as too wide.
 TRIES_MOST = 200
-# Waves of the outline around the organ, from two on.
+# Wave numbers of the outline around the organ.
 WAVES = (2, 3, 4)
-# Members whose anatomy is kept, the most recently used: a liver with the tables of its chart takes some 5 MB.
-KEPT_MOST = 128
+# Cached anatomies, the most recently used: a liver with the tables of its chart takes some 5 MB.
+CACHED_MOST = 128
 
 
 @dataclass(frozen=True, eq=False)
 class MemberShape:
-    """What makes a member of its template; lengths in [m], in the frame of the instrument.
+    """Deformation of the template into a member, in the frame of the instrument.
 
     Fields:
         middle: of the template's box [m]                                            (3,)
@@ -46,7 +46,7 @@ class MemberShape:
         half_length: of the template's box in this frame [m]                         (3,)
         stretch: factor along each direction                                         (3,)
         wave: amplitudes of cosine and sine of each of WAVES                         (n_wave, 2)
-        bump_place, bump_way: middle and displacement of each bump [m]               (n_bump, 3)
+        bump_place, bump_shift: middle and displacement of each bump [m]             (n_bump, 3)
         bump_width: standard deviation of each [m]                                   (n_bump,)
         bend: curvatures k_uu, k_uv, k_vv [1/m]                                      (3,)
     """
@@ -57,12 +57,12 @@ class MemberShape:
     stretch: FloatArray
     wave: FloatArray
     bump_place: FloatArray
-    bump_way: FloatArray
+    bump_shift: FloatArray
     bump_width: FloatArray
     bend: FloatArray
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Where points of the template [m] (n, 3) are in the member [m] (n, 3)."""
+        """Points of the template [m] (n, 3) mapped into the member [m] (n, 3)."""
         places = matmul(np.asarray(points, dtype=np.float64) - self.middle, self.frame.T)
         spread = places[:, :2] / self.half_length[:2]
         places = places * self.stretch
@@ -74,9 +74,9 @@ class MemberShape:
             outline += along * cosine + across * sine
         places[:, :2] *= 1.0 + outline[:, None]
         bumped = places.copy()
-        for place, way, width in zip(self.bump_place, self.bump_way, self.bump_width, strict=True):
+        for place, shift, width in zip(self.bump_place, self.bump_shift, self.bump_width, strict=True):
             square = np.square(places - place).sum(axis=1)
-            bumped += exp(-square / (2.0 * (width * width)))[:, None] * way
+            bumped += exp(-square / (2.0 * (width * width)))[:, None] * shift
         u, v = bumped[:, 0], bumped[:, 1]
         k_uu, k_uv, k_vv = self.bend
         bumped[:, 2] += 0.5 * (k_uu * (u * u) + 2.0 * k_uv * u * v + k_vv * (v * v))
@@ -84,7 +84,7 @@ class MemberShape:
 
 
 def draw_shape(family: Family, template: Anatomy, rng: np.random.Generator) -> MemberShape:
-    """Draw a deformation from the ranges of a family, around the organ of its scene."""
+    """Draw a deformation of a template from the ranges of a family."""
     points, approach = template.mesh.points, template.face.approach
     frame = np.stack([*tangent_axes(approach), approach])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -97,9 +97,9 @@ def draw_shape(family: Family, template: Anatomy, rng: np.random.Generator) -> M
     phase = rng.uniform(0.0, 2.0 * math.pi, len(WAVES))
     amplitude = rng.uniform(0.0, family.edge / len(WAVES), len(WAVES))
     surface = template.mesh.boundary_nodes
-    chosen = surface[rng.integers(len(surface), size=family.bump_count)]
-    way = rng.normal(size=(family.bump_count, 3))
-    way /= norm(way, axis=1, keepdims=True)
+    bump_nodes = surface[rng.integers(len(surface), size=family.bump_count)]
+    direction = rng.normal(size=(family.bump_count, 3))
+    direction /= norm(direction, axis=1, keepdims=True)
     height = rng.uniform(-family.bump_height, family.bump_height, family.bump_count)
     return MemberShape(
         middle=middle,
@@ -107,15 +107,15 @@ def draw_shape(family: Family, template: Anatomy, rng: np.random.Generator) -> M
         half_length=np.abs(places).max(axis=0),
         stretch=stretch,
         wave=np.stack([amplitude * cos(phase), amplitude * sin(phase)], axis=1),
-        bump_place=places[chosen] * stretch,
-        bump_way=height[:, None] * way,
+        bump_place=places[bump_nodes] * stretch,
+        bump_shift=height[:, None] * direction,
         bump_width=rng.uniform(*family.bump_width, size=family.bump_count),
         bend=rng.uniform(-family.curvature, family.curvature, 3) * [1.0, 0.5, 1.0],
     )
 
 
 def make_member(template: Anatomy, name: MemberName) -> Anatomy:
-    """The anatomy of a member, always the same: its random numbers are those of SeedSequence(entropy, (split, number)).
+    """Anatomy of a member, reproducible: its random numbers are those of SeedSequence(entropy, (split, number)).
 
     Tets, anchored nodes, nodes on foundations and triangles of the palpable face are the template's. A deformation that
     turns a tet inside out, leaves one less than `quality_share` of its radius ratio, or leaves the box of the family
@@ -147,13 +147,11 @@ def make_member(template: Anatomy, name: MemberName) -> Anatomy:
     )
 
 
-@lru_cache(maxsize=KEPT_MOST)
-def _kept_member(template: Anatomy, name: MemberName) -> Anatomy:
-    return make_member(template, name)
+_cached_member = lru_cache(maxsize=CACHED_MOST)(make_member)
 
 
 class OrganFamily:
-    """The members of one split of a scene's family, made when they are first asked for.
+    """Members of one split of a scene's family, generated on first use.
 
     Fields:
         template: the scene's organ
@@ -162,13 +160,13 @@ class OrganFamily:
     """
 
     def __init__(self, template: Anatomy, split: str) -> None:
-        """Take the anatomy of a scene that has a family; `family_of` checks both."""
+        """Take the anatomy of a scene with a family; `family_of` checks both."""
         assert template.scene.family is not None
         self.template, self.split = template, split
         self.size = template.scene.family.member_count(split)
 
     def member(self, number: int) -> Anatomy:
-        """A member by its number; the most recently used ones are kept.
+        """Member of a number; the most recently used ones are cached.
 
         Raises:
             ValueError: a number beyond the split.
@@ -178,14 +176,14 @@ class OrganFamily:
                 f"scene {self.template.scene.name!r} has no member {number} in split {self.split!r}; they are numbered "
                 f"from 0 to {self.size - 1}"
             )
-        return _kept_member(self.template, MemberName(self.split, number))
+        return _cached_member(self.template, MemberName(self.split, number))
 
     def draw(self, rng: np.random.Generator) -> Anatomy:
-        """A member drawn uniformly."""
+        """Draw a member uniformly."""
         return self.member(int(rng.integers(self.size)))
 
     def named(self, text: str) -> Anatomy:
-        """The member that `str(anatomy.member)` names.
+        """Member of the name `str(anatomy.member)`.
 
         Raises:
             ValueError: no such member, or one of another split.
@@ -200,7 +198,7 @@ class OrganFamily:
 
 
 def family_of(template: Anatomy, split: str | None) -> OrganFamily | None:
-    """The members that episodes of an anatomy are played with; None for a scene of one organ.
+    """Members for the episodes of an anatomy; None for a scene of one organ.
 
     Args:
         template: the scene's own organ.

@@ -1,4 +1,4 @@
-"""Difficulty levels of palpation: the lesions that an episode hides, as shares of a scene's ranges, and their draw."""
+"""Difficulty levels of palpation: hidden lesions as shares of a scene's ranges, and their draw."""
 
 import json
 import math
@@ -14,28 +14,28 @@ from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import make_material, nearest
 from surgsim_env.scene.model import LesionDraw, Range, Scene
 
-# Least distance between lesions' balls under a tip of radius REFERENCE_TIP [m], in proportion for other tips: nearer
+# Least gap between lesions' balls under a tip of radius REFERENCE_TIP [m], in proportion for other tips: nearer
 # lesions are felt as one.
 LESION_GAP = 0.006
 REFERENCE_TIP = 0.008
-# Draws of one lesion that is too near to the others, and draws of all lesions, before giving up.
+# Draws of one lesion apart from the others, and draws of all lesions, before giving up.
 PLACES_MOST = 20
 TRIES_MOST = 200
-# A drawn capsule is this thick [m]; what counts is its modulus times this, 5 to 20 N/m: that of the scene `liver`
+# Thickness of a drawn capsule [m]; only its modulus times thickness matters, 5 to 20 N/m: that of the scene `liver`
 # is 20 N/m, which adds some 7 % to an indentation, as a human one does (Roan 2010, doi 10.1115/1.4002369).
 CAPSULE_THICKNESS = 2e-5
 CAPSULE_STIFFNESS = (5.0, 20.0)
-# Factor on the substeps of a scene whose tissue is given another law: strained tissue and the fast part of a relaxation
+# Factor on the substeps of a scene with another law of tissue: strained tissue and the fast part of a relaxation
 # are stiffer than tissue at rest.
 TISSUE_SUBSTEPS = 2
 
 
 @dataclass(frozen=True)
 class Level:
-    """A difficulty level. A share f of a scene's range [low, high] is low + f (high - low); f may lie outside [0, 1].
+    """Difficulty level. A share f of a scene's range [low, high] is low + f (high - low); f may lie outside [0, 1].
 
     Args:
-        name: as arguments give it.
+        name: its key in LEVELS.
         lesion_count_weights: probabilities of 0, 1, 2, ... lesions.
         radius, cover, modulus_ratio: shares of the scene's `[lesion]` ranges, from and to.
         background: range of the factor on the healthy tissue's modulus; lesions keep their ratio to it.
@@ -43,10 +43,10 @@ class Level:
         sensor_noise, sensor_bias: factors on the scene's force sensor.
         sensor_drift: largest drift of the force sensor, as a share of its range in a second.
         sensor_hysteresis: half the width of its loop, as a share of its range.
-        tissue: material of the library whose law healthy tissue has, with the scene's own modulus and density; None:
+        tissue: material of the library with the law of healthy tissue; modulus and density stay the scene's; None:
             the scene's law.
-        motion: how the patient moves, where the environment's arguments do not say; None: as the scene says.
-        map_error: deviation along each of the chart's sides at which the healthy map lies off the organ [m]; each
+        motion: preset of the patient's motion, unless the environment's arguments name one; None: the scene's motions.
+        map_error: standard deviation of the healthy map's offset from the organ along each side of the chart [m]; each
             episode draws one.
     """
 
@@ -66,7 +66,7 @@ class Level:
     map_error: float = 0.0
 
     def scene(self, scene: Scene) -> Scene:
-        """A scene at this level: with its sensor and tissue, and mass scaling where stiffer tissue needs it.
+        """Scene at this level: with its sensor and tissue, and mass scaling for stiffer tissue.
 
         Raises:
             ValueError: the scene has no [lesion] table, or the level's share of one of its ranges is invalid.
@@ -84,7 +84,7 @@ class Level:
         return replace(healthy, sensor=sensor, timing=replace(healthy.timing, mass_scaling=True))
 
     def healthy(self, scene: Scene) -> Scene:
-        """A scene with this level's healthy tissue, before an operation."""
+        """Scene with this level's healthy tissue, before an operation."""
         if self.tissue is None:
             return scene
         law, own = make_material(self.tissue).material, scene.material
@@ -95,7 +95,7 @@ class Level:
         return replace(scene, material=material, timing=timing)
 
     def lesion_draw(self, scene: Scene) -> LesionDraw:
-        """The lesion ranges of a scene at this level."""
+        """Lesion ranges of a scene at this level."""
         draw = scene.lesion
         if draw is None:
             raise ValueError(
@@ -113,7 +113,7 @@ class Level:
         return replace(draw, **shares)
 
     def ranges(self, draw: LesionDraw) -> LesionDraw:
-        """This level's shares of some ranges."""
+        """Lesion ranges with this level's shares."""
         return replace(draw, **self._shares(draw))
 
     def _shares(self, draw: LesionDraw) -> dict[str, tuple[float, float]]:
@@ -123,12 +123,12 @@ class Level:
         """Draw an organ.
 
         Args:
-            anatomy: of a scene made by `scene`.
+            anatomy: of a scene from `scene`.
             rng: source of random numbers.
             lesion_count: number of lesions; None: drawn.
 
         Raises:
-            ValueError: TRIES_MOST draws find no room for the lesions.
+            ValueError: no room for the lesions in TRIES_MOST draws.
         """
         weights = self.lesion_count_weights
         count = int(rng.choice(len(weights), p=weights)) if lesion_count is None else lesion_count
@@ -136,35 +136,14 @@ class Level:
         capsule = 0.0
         if anatomy.scene.capsule is None and rng.random() < self.capsule_share:
             capsule = float(rng.uniform(*CAPSULE_STIFFNESS))
-        for _ in range(TRIES_MOST):
-            lesions = self._lesions(anatomy, rng, count, background)
-            if lesions is not None:
-                return DrawnOrgan(tuple(lesions), background, capsule)
-        raise ValueError(
-            f"scene {anatomy.scene.name!r}: {count} lesions of level {self.name!r} found no room beside each other in "
-            f"{TRIES_MOST} draws: use smaller lesions, or a larger palpable face"
-        )
-
-    def _lesions(
-        self, anatomy: Anatomy, rng: np.random.Generator, count: int, background: float
-    ) -> list[Lesion] | None:
-        """Draw lesions apart from each other; None if one of them finds no place in PLACES_MOST draws."""
-        ranges, lesions = self.lesion_draw(anatomy.scene), []
-        gap = LESION_GAP * anatomy.scene.instrument.tip_radius / REFERENCE_TIP
-        for number in range(count):
-            for _ in range(PLACES_MOST):
-                lesion = anatomy.random_lesion(rng, ranges, modulus_factor=background)
-                if _apart(lesion, lesions, gap):
-                    lesions.append(replace(lesion, name=f"lesion {number + 1}"))
-                    break
-            else:
-                return None
-        return lesions
+        place = f"level {self.name!r} of scene {anatomy.scene.name!r}"
+        lesions = _draw_lesions(anatomy, self.lesion_draw(anatomy.scene), rng, count, background, place)
+        return DrawnOrgan(lesions, background, capsule)
 
 
 @dataclass(frozen=True)
 class DrawnOrgan:
-    """The organ that an episode draws.
+    """Organ of an episode, drawn at random.
 
     Args:
         lesions: spheres.
@@ -176,8 +155,33 @@ class DrawnOrgan:
     background: float = 1.0
     capsule_stiffness: float = 0.0
 
+    @classmethod
+    def draw(
+        cls,
+        anatomy: Anatomy,
+        rng: np.random.Generator,
+        level: Level | None = None,
+        lesion_count: int | tuple[int, int] | None = None,
+    ) -> "DrawnOrgan":
+        """Draw the organ of an episode.
+
+        Args:
+            anatomy: of a scene made by the level's `scene`.
+            rng: source of random numbers.
+            level: of the lesions; None for the scene's own ranges.
+            lesion_count: number of lesions, or its least and most; None: drawn by the level, without a level none.
+
+        Raises:
+            ValueError: lesions of a scene without a [lesion] table, or TRIES_MOST draws find no room for them.
+        """
+        count = int(rng.integers(*lesion_count, endpoint=True)) if isinstance(lesion_count, tuple) else lesion_count
+        if level is not None:
+            return level.draw(anatomy, rng, lesion_count=count)
+        place = f"scene {anatomy.scene.name!r}"
+        return cls(_draw_lesions(anatomy, anatomy.scene.lesion, rng, count or 0, 1.0, place))
+
     def compiled(self, anatomy: Anatomy) -> OrganModel:
-        """The compiled organ of an anatomy with everything that was drawn."""
+        """Compile the organ on an anatomy."""
         specification = anatomy.specification(self.lesions, modulus_factor=self.background)
         if self.capsule_stiffness > 0.0:
             membrane = Capsule(self.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
@@ -185,26 +189,49 @@ class DrawnOrgan:
         return anatomy.compiled(specification)
 
     def places(self, anatomy: Anatomy) -> FloatArray:
-        """The palpable face's point nearest to each lesion's centre [m], shape (n_lesion, 3)."""
+        """Points of the palpable face nearest to the lesions' centres [m], shape (n_lesion, 3)."""
         points = [anatomy.face.project(np.asarray(lesion.centre))[0] for lesion in self.lesions]
         return np.array(points).reshape(-1, 3)
 
     def to_json(self) -> str:
-        """The draw as JSON, with numbers written exactly."""
+        """Exact JSON of the draw."""
         lesions = [[*lesion.centre, lesion.radius, lesion.material.youngs_modulus] for lesion in self.lesions]  # type: ignore[misc, union-attr]
-        # A whole number in a user's own draw is written as the float that it is read as.
+        # A whole number in a user's own draw is written as a float, as it is read.
         numbers = {"background": float(self.background), "capsule_stiffness": float(self.capsule_stiffness)}
-        return json.dumps({"lesions": [list(map(float, one)) for one in lesions], **numbers})
+        return json.dumps({"lesions": [list(map(float, row)) for row in lesions], **numbers})
 
     @classmethod
     def from_json(cls, text: str, anatomy: Anatomy) -> "DrawnOrgan":
-        """The draw that `to_json` wrote for the same anatomy."""
+        """Read the JSON of `to_json` for the same anatomy."""
         saved = json.loads(text)
         lesions = [
-            anatomy.lesion_of_modulus(numbers[:3], numbers[3], numbers[4], f"lesion {n + 1}")
-            for n, numbers in enumerate(saved["lesions"])
+            anatomy.lesion_of_modulus(row[:3], row[3], row[4], f"lesion {number}")
+            for number, row in enumerate(saved["lesions"], start=1)
         ]
         return cls(tuple(lesions), saved["background"], saved["capsule_stiffness"])
+
+
+def _draw_lesions(
+    anatomy: Anatomy, ranges: LesionDraw | None, rng: np.random.Generator, count: int, background: float, place: str
+) -> tuple[Lesion, ...]:
+    """Draw lesions apart from each other, in tissue of a modulus factor; `place` names their origin in an error."""
+    gap = LESION_GAP * anatomy.scene.instrument.tip_radius / REFERENCE_TIP
+    for _ in range(TRIES_MOST):
+        lesions: list[Lesion] = []
+        for _ in range(count):
+            for _ in range(PLACES_MOST):
+                lesion = anatomy.random_lesion(rng, ranges, modulus_factor=background)
+                if _apart(lesion, lesions, gap):
+                    lesions.append(replace(lesion, name=f"lesion {len(lesions) + 1}"))
+                    break
+            else:
+                break
+        if len(lesions) == count:
+            return tuple(lesions)
+    raise ValueError(
+        f"{place}: {count} lesions found no room beside each other in {TRIES_MOST} draws: use smaller or fewer "
+        "lesions, or a larger palpable face"
+    )
 
 
 def _share(bounds: Range, share: Range) -> Range:
@@ -213,7 +240,7 @@ def _share(bounds: Range, share: Range) -> Range:
 
 
 def _apart(lesion: Lesion, others: Sequence[Lesion], gap: float) -> bool:
-    """Whether a ball keeps a gap [m] from all others."""
+    """True if a ball keeps a gap [m] from all others."""
     return all(
         math.dist(lesion.centre, other.centre) >= lesion.radius + other.radius + gap  # type: ignore[arg-type, operator]
         for other in others
@@ -253,10 +280,10 @@ LEVELS: Mapping[str, Level] = {
 
 
 def find_level(name: str) -> Level:
-    """The level of a name.
+    """Level of a name.
 
     Raises:
-        ValueError: an unknown name; lists the known, suggests the nearest.
+        ValueError: an unknown name; lists the known ones, suggests the nearest.
     """
     if not isinstance(name, str) or name not in LEVELS:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The contents of a scene file as frozen dataclasses. All values are SI; comments in the files give their sources."""
+"""Contents of a scene file as frozen dataclasses, in SI units; comments in the files give sources."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,29 +17,27 @@ from msdm_core.organ.support import Support
 Vector = tuple[float, float, float]
 Range = tuple[float, float]
 
-# A motion of an organ's end is centred at the nodes within this share of its length from there.
+# Share of an organ's length that counts as its end, the centre of a motion.
 END_SHARE = 0.05
-# Instruments and places in an organ are smaller and nearer than this [m]: MuJoCo's numbers stay far from overflow.
-LENGTH_LARGEST = 100.0
 
 
-def require_number(what: str, value: float, least: float, unit: str, *, above: bool = False) -> None:
-    """Raise a ValueError for an entry that is not finite, or not at least (or above) a bound."""
+def require_number(entry: str, value: float, least: float, unit: str, *, above: bool = False) -> None:
+    """Raise a ValueError unless an entry is finite and at least (or above) a bound."""
     if not (math.isfinite(value) and (value > least if above else value >= least)):
         rule = f"above {least:g}" if above else f"at least {least:g}"
-        raise ValueError(f"{what} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
+        raise ValueError(f"{entry} is {value:g} {unit}".rstrip() + f"; it must be finite and {rule}")
 
 
-def require_direction(what: str, values: Vector) -> None:
-    """Raise a ValueError for a direction that is zero or not finite, or whose square would be."""
+def require_direction(entry: str, values: Vector) -> None:
+    """Raise a ValueError unless a direction and its square are finite and not zero."""
     if not 1e-100 <= math.hypot(*values) <= 1e100:
-        raise ValueError(f"{what} is {values}; it must be a direction such as [0, 0, -1]")
+        raise ValueError(f"{entry} is {values}; it must be a direction such as [0, 0, -1]")
 
 
-def _require_range(what: str, bounds: Range) -> None:
+def _require_range(entry: str, bounds: Range) -> None:
     low, high = bounds
     if not 0.0 < low <= high < math.inf:
-        raise ValueError(f"{what} = [{low:g}, {high:g}]; the rule is 0 < low <= high, finite")
+        raise ValueError(f"{entry} = [{low:g}, {high:g}]; the rule is 0 < low <= high, finite")
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,10 @@ class FineSurface:
 
 @dataclass(frozen=True)
 class MeshSource:
-    """Where the organ's tets come from: exactly one of block, surface, tets.
+    """Source of the organ's tets: exactly one of block, surface, tets.
 
-    Pictures and the live page draw the fine_surface, which moves with the tets; without one the tets' boundary,
-    smoothed. It changes no force and nothing that is touched.
+    Pictures and the live page draw the fine_surface, moving with the tets; without one the tets' boundary, smoothed. It
+    changes no force and no contact.
     """
 
     block: BlockMesh | None = None
@@ -116,7 +114,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Side:
-    """The surface whose outward normal is less than an angle from a direction; 90 degrees: all that faces that way."""
+    """Surface with outward normals less than an angle from a direction; 90 degrees: all of it facing that way."""
 
     direction: Vector
     angle_deg: float = 90.0
@@ -129,10 +127,10 @@ class Side:
 
 @dataclass(frozen=True)
 class Anchor:
-    """A place where the organ is held, by fixed nodes or by tissue around it.
+    """Support of the organ at a place, by fixed nodes or by elastic tissue around it.
 
-    Without a stiffness every surface node inside is fixed; inside a box, every node. With one the surface nodes inside
-    lie on springs to the ground, so many per area, as on fat or a ligament (`msdm_core.organ.foundation`).
+    Without a stiffness all surface nodes inside are fixed; inside a box, all nodes. With one the surface nodes inside
+    lie on springs to the ground, distributed over the area, as on fat or a ligament (`msdm_core.organ.foundation`).
 
     Args:
         name: of the tissue.
@@ -149,34 +147,34 @@ class Anchor:
     shear_stiffness: float | None = None
 
     def __post_init__(self) -> None:
-        what = f"anchor {self.name!r}"
+        owner = f"anchor {self.name!r}"
         if sum(part is not None for part in (self.box, self.ball, self.side)) != 1:
-            raise ValueError(f"{what}: give one of a box, a ball and a side")
+            raise ValueError(f"{owner}: give one of a box, a ball and a side")
         if (self.stiffness is None) != (self.shear_stiffness is None):
             raise ValueError(
-                f"{what}: stiffness and shear_stiffness go together; give both for elastic tissue, none for fixed nodes"
+                f"{owner}: stiffness and shear_stiffness go together; both for elastic tissue, none for fixed nodes"
             )
         if self.stiffness is not None and self.shear_stiffness is not None:
-            require_number(f"{what}: stiffness", self.stiffness, 0.0, "N/m^3", above=True)
-            require_number(f"{what}: shear_stiffness", self.shear_stiffness, 0.0, "N/m^3")
+            require_number(f"{owner}: stiffness", self.stiffness, 0.0, "N/m^3", above=True)
+            require_number(f"{owner}: shear_stiffness", self.shear_stiffness, 0.0, "N/m^3")
 
     @property
     def is_elastic(self) -> bool:
-        """Whether it holds by springs in place of fixed nodes."""
+        """True if springs hold the organ in place of fixed nodes."""
         return self.stiffness is not None
 
 
 @dataclass(frozen=True)
 class LibraryMaterial:
-    """A material of the library (`load.list_materials`), or of a file of the same form.
+    """Material of the library (`load.list_materials`) or of a file of the same form.
 
     Args:
         name: stem of its file.
         description: one line.
         material: its law and density.
-        source: where the numbers come from.
+        source: publication or measurement of the numbers.
         condition: specimen, its state and the test.
-        interval: how far the numbers spread.
+        interval: spread of the numbers.
     """
 
     name: str
@@ -189,13 +187,13 @@ class LibraryMaterial:
 
 @dataclass(frozen=True)
 class TissueRegion:
-    """A region of the mesh with a material of its own.
+    """Region of the mesh with a material of its own.
 
     Args:
         name: of the region in the mesh file.
         material: of its tets.
-        lesion: whether palpation looks for it. It is then a demonstration lesion, and healthy organs (pre-operative
-            models, episodes that hide a lesion of their own) do not have it. Otherwise every organ has it.
+        lesion: True for a demonstration lesion, a target of palpation: healthy organs (pre-operative models, episodes
+            with a lesion of their own) do not have it. All organs have other regions.
     """
 
     name: str
@@ -204,13 +202,13 @@ class TissueRegion:
 
     @property
     def as_lesion(self) -> Lesion:
-        """The region as `compile_organ` takes it."""
+        """Region in the form of `compile_organ`."""
         return Lesion(region=self.name, material=self.material, name=self.name)
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact between tissue and instrument; the law is msdm_core.kernels.structure_kernels.ContactLaw.
+    """Contact between tissue and instrument, with the law of msdm_core.kernels.structure_kernels.ContactLaw.
 
     Args:
         stiffness: pressure per penetration [N/m^3].
@@ -229,25 +227,25 @@ class Contact:
 
     @property
     def law(self) -> ContactLaw:
-        """The contact law for the kernels; sticking friction is half as stiff as the normal direction."""
+        """Contact law for the kernels; sticking friction is half as stiff as the normal direction."""
         return ContactLaw(self.stiffness, self.damping, self.friction, 0.5 * self.stiffness)
 
 
-# Instruments carried by slides; their models are NAME.xml in scenes/instruments.
+# Instruments on slides; their models are NAME.xml in scenes/instruments.
 CARTESIAN = ("probe", "grasper")
-# Instruments of two arms, left and right. "LEFT+RIGHT" makes a pair of any two arms, see `load.pair_names`.
+# Instruments of two arms, left and right; for other pairs "LEFT+RIGHT", see `load.pair_names`.
 PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
 
 
 @dataclass(frozen=True)
 class SceneInstrument:
-    """The instrument of a scene, and its direction of approach.
+    """Instrument of a scene, and its direction of approach.
 
     Args:
         model: MJCF file of a probe or grasper in scenes/instruments, a shipped arm's name, the path of an arm's TOML
             file, or a pair of arms: one of PAIRS, or two as "LEFT+RIGHT".
         tip_radius: of the ball tip [m].
-        approach: direction in which it approaches the organ, and of its shaft.
+        approach: direction of its motion to the organ, and of its shaft.
         tip_direction: direction of a grasper's jaw and an arm's tip; by default the approach.
     """
 
@@ -266,7 +264,7 @@ class SceneInstrument:
 
 @dataclass(frozen=True)
 class Port:
-    """The frame of a port: its origin is the trocar, its -z points into the body.
+    """Frame of a port: its origin is the trocar, its -z points into the body.
 
     Args:
         point: the trocar [m], world frame.
@@ -292,7 +290,7 @@ class Port:
 
 
 def frame_into(into: FloatArray, roll: float = 0.0) -> FloatArray:
-    """A right-handed frame whose -z is a direction, its x near world x (else y), turned by roll [rad]; (3, 3)."""
+    """Right-handed frame with -z along a direction and x near world x (else y), turned by roll [rad], (3, 3)."""
     z = -into / norm(into)
     near = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = near - matmul(near, z) * z
@@ -302,18 +300,18 @@ def frame_into(into: FloatArray, roll: float = 0.0) -> FloatArray:
     return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
 
 
-# Largest substep over the stable step of the organ at rest; a pressed organ is stiffer and needs the margin. Where mass
-# is added, many nodes stand at the limit, also under the tip: on a kidney a press turned tets inside out at 0.9.
+# Largest substep over the stable step of the organ at rest; a pressed organ is stiffer and needs the margin. With added
+# mass, many nodes are at the limit, also under the tip: on a kidney a press turned tets inside out at 0.9.
 STABLE_STEP_SHARE, SCALED_STEP_SHARE = 0.9, 0.75
 
 
 def scaled_step(haptic_step: float, substep_count: int) -> float:
-    """The stable step [s] up to which mass is added for a number of substeps of a haptic step."""
+    """Stable step [s] aimed at by mass scaling for a number of substeps of a haptic step."""
     return haptic_step / (SCALED_STEP_SHARE * substep_count)
 
 
 def substeps_needed(haptic_step: float, stable_step: float) -> int:
-    """Fewest organ substeps of a haptic step that keep each below STABLE_STEP_SHARE of the stable step."""
+    """Fewest organ substeps of a haptic step, each at most STABLE_STEP_SHARE of the stable step."""
     return math.ceil(haptic_step / (STABLE_STEP_SHARE * stable_step))
 
 
@@ -321,7 +319,7 @@ def substeps_needed(haptic_step: float, stable_step: float) -> int:
 class Timing:
     """Time steps: haptic_step [s], organ substeps per haptic step, haptic steps per control step.
 
-    With mass_scaling, nodes that need more substeps than that are given more mass (`msdm_core.organ.stability`).
+    With mass_scaling, mass is added to nodes in need of more substeps (`msdm_core.organ.stability`).
     """
 
     haptic_step: float = 0.001
@@ -342,11 +340,11 @@ class Timing:
 
 @dataclass(frozen=True)
 class Limits:
-    """Force limits [N]: more than soft_force costs reward, more than hard_force ends an episode, and so does tearing.
+    """Force limits [N]: more than soft_force costs reward, more than hard_force ends an episode, as does tearing.
 
-    A jaw that pulls with more than tear_force tears the tissue; by default nothing tears. A largest contact pressure
-    [Pa] or principal strain (1) of the tissue beyond pressure or strain damages it, which ends an episode as well; inf
-    measures them only, and None, the default, does not measure them.
+    A jaw's pull above tear_force tears the tissue; by default nothing tears. Contact pressure [Pa] or principal strain
+    (1) of the tissue beyond pressure or strain damages it and also ends an episode; inf measures them only, and None,
+    the default, does not measure them.
     """
 
     soft_force: float
@@ -370,11 +368,11 @@ class Limits:
 
     @property
     def judges_tissue(self) -> bool:
-        """Whether the largest pressure and strain of the tissue are measured in each control step."""
+        """True if the largest pressure and strain of the tissue are measured in each control step."""
         return self.pressure is not None or self.strain is not None
 
     def excess(self, force: float) -> float:
-        """A force [N] on a scale from the soft limit (0) to the hard limit (1), not clipped."""
+        """Force [N] on a scale from the soft limit (0) to the hard limit (1), not clipped."""
         return (force - self.soft_force) / (self.hard_force - self.soft_force)
 
 
@@ -386,7 +384,7 @@ class ForceSensor:
         noise: standard deviation of each reading [N].
         bias: largest bias [N]; each episode draws one uniformly from [-bias, bias].
         range: largest reading [N].
-        drift: largest rate at which the bias changes [N/s]; each episode draws one uniformly from [-drift, drift].
+        drift: largest rate of the bias [N/s]; each episode draws one uniformly from [-drift, drift].
         hysteresis: half the width of the loop of a slow cycle [N]: the held force follows the force with a play of
             +-hysteresis (the play operator, Visintin 1994, Differential Models of Hysteresis, III.2).
     """
@@ -405,7 +403,7 @@ class ForceSensor:
 
 @dataclass(frozen=True)
 class PalpationSettings:
-    """How the organ is palpated.
+    """Settings of palpation.
 
     Args:
         press_depth: depth of a press along the surface normal [m].
@@ -434,7 +432,7 @@ class PalpationSettings:
 
 @dataclass(frozen=True)
 class LesionDraw:
-    """The hidden lesion of an episode, drawn uniformly below the palpable face.
+    """Ranges of an episode's hidden lesion, drawn uniformly below the palpable face.
 
     Args:
         radius: range of its radius [m].
@@ -456,7 +454,7 @@ class LesionDraw:
 
 @dataclass(frozen=True)
 class FixedLesion:
-    """A lesion of the demonstration: below a surface point [m], with cover [m], radius [m] and modulus ratio."""
+    """Demonstration lesion below a surface point [m], with cover [m], radius [m] and modulus ratio."""
 
     name: str
     below: Vector
@@ -467,7 +465,7 @@ class FixedLesion:
 
 @dataclass(frozen=True)
 class Endoscope:
-    """The endoscope: position and target of its camera [m], vertical field of view [degrees]."""
+    """Endoscope: position and target of its camera [m], vertical field of view [degrees]."""
 
     position: Vector
     target: Vector
@@ -486,7 +484,7 @@ class RetractionCamera:
     """Random displacement of the endoscope in an episode.
 
     Args:
-        shift: radius of the ball in which its position is drawn uniformly [m].
+        shift: radius of the ball of positions, drawn uniformly [m].
         turn_deg: largest rotation of its view about an axis across it [degrees].
     """
 
@@ -496,7 +494,7 @@ class RetractionCamera:
 
 @dataclass(frozen=True)
 class Flap:
-    """The part of an organ that is lifted, if not the whole organ: corners of its box [m]."""
+    """Lifted part of an organ: corners of its box [m]."""
 
     lower: Vector
     upper: Vector
@@ -504,24 +502,24 @@ class Flap:
 
 @dataclass(frozen=True)
 class Retraction:
-    """Ranges from which each episode of a retraction is drawn: the lobe, the target it hides, the tip's start.
+    """Ranges of a retraction's episodes: the lobe, the hidden target, the tip's start.
 
     The lobe is a block with x along its anchored edge, y from that edge (y = 0) to the free one, and z up; it lies on a
-    bed whose top is z = 0. For an organ of another shape this holds for its `flap`, and scale and held share are 1.
+    bed below z = 0. An organ of another shape has a `flap` like that, and its scale and held share are 1.
 
     Args:
         target_distance: range of the target's distance from the anchored edge, along y [m].
         target_along: range of its position along the edge, x [m].
-        start_lower, start_upper: corners of the box in which the tip starts [m].
+        start_lower, start_upper: corners of the box of the tip's starts [m].
         target_radius: of the disc to be exposed [m].
-        scale: range of the factor on the whole lobe, its thickness included (cells stay cubic).
+        scale: range of the factor on the lobe's lengths, thickness included (cells stay cubic).
         youngs_modulus: range [Pa].
-        capsule_share: share of the episodes in which the lobe has a capsule.
+        capsule_share: share of episodes with a capsule on the lobe.
         capsule_stiffness: range of that capsule's modulus times thickness [N/m].
-        held_share: range of the share of the anchored edge, about its middle, that is held.
+        held_share: range of the held share of the anchored edge, about its middle.
         camera: displacement of the endoscope.
-        right_start_lower, right_start_upper: corners of the box in which the right one of two tips starts [m].
-        flap: the part of the organ that is lifted; None: all of it.
+        right_start_lower, right_start_upper: the same for the right one of two tips [m].
+        flap: the lifted part of the organ; None: all of it.
     """
 
     target_distance: Range
@@ -556,19 +554,19 @@ class Retraction:
 
 @dataclass(frozen=True)
 class CyclicMotion:
-    """A motion of anchors, foundations and supports that repeats, drawn anew for each episode.
+    """Repeated motion of anchors, foundations and supports, drawn anew for each episode.
 
     Args:
         name: as "breathing".
         displacement: of the ground at the top of a cycle of size 1 [m].
         period: range of the mean duration of a cycle [s].
-        rise, fall: shares of a cycle in which the ground moves there and back; it rests in what is left.
+        rise, fall: shares of a cycle for the motion there and back; the ground rests in the remainder.
         size: range of the factor on the displacement.
         variation: standard deviation of the durations and sizes of cycles, as a share of their mean.
-        centre: of the part of the ground that moves [m]; None: all of it moves alike.
-        reach: distance from the centre beyond which nothing moves [m].
-        side: in place of `centre`: the direction of the organ's end which is the centre.
-        stops_in_apnoea: whether it rests while the breath is held.
+        centre: of the moving part of the ground [m]; None: all of it moves alike.
+        reach: radius of the moving part about the centre [m].
+        side: in place of `centre`: the direction of the organ's end at the centre.
+        stops_in_apnoea: True if it rests while the breath is held.
     """
 
     name: str
@@ -599,11 +597,11 @@ class CyclicMotion:
             require_direction(f"motion {self.name!r}: side", self.side)
             if self.centre is not None:
                 raise ValueError(f"motion {self.name!r}: give a side or a centre, not both")
-        # What is wrong with displacement, centre and reach is said there.
+        # Checks displacement, centre and reach.
         Motion(self.name, self.displacement, self.side or self.centre, self.reach)
 
     def ground(self, points: FloatArray) -> Motion:
-        """How a unit of the signal moves the ground of an organ whose nodes rest at some points [m] (n_node, 3)."""
+        """Motion of the ground by a unit of the signal, for an organ with resting nodes [m] (n_node, 3)."""
         if self.side is None:
             return Motion(self.name, self.displacement, self.centre, self.reach)
         along = matmul(points, np.array(self.side) / norm(self.side))
@@ -611,7 +609,7 @@ class CyclicMotion:
         return Motion(self.name, self.displacement, (x, y, z), self.reach)
 
 
-# The parts of a family: an agent learns on the first, is chosen by the second and judged by the third.
+# The parts of a family: for training, selection and evaluation of an agent.
 SPLITS = ("train", "validation", "test")
 # The factors on lengths of a family lie within this range.
 FACTOR_LEAST, FACTOR_MOST = 0.5, 2.0
@@ -619,18 +617,18 @@ FACTOR_LEAST, FACTOR_MOST = 0.5, 2.0
 
 @dataclass(frozen=True)
 class Family:
-    """Ranges of smooth random deformations, by which the organ of a scene becomes a family of organs.
+    """Ranges of smooth random deformations of a scene's organ into a family of organs.
 
-    The organ is stretched, its outline changed, bumped and bent (`surgsim_env.scene.family`); directions are those of
-    its instrument: along the approach, and across it. In the scene's file, a `template` beside these entries names the
-    file of another scene whose entries hold where this file has none of its own.
+    The organ is stretched, its outline changed, bumped and bent (`surgsim_env.scene.family`), in the directions along
+    and across its instrument's approach. In the scene's file, a `template` beside these entries names the file of
+    another scene: its entries hold unless this file has its own.
 
-    A member that folds, whose cells become too poor, or that leaves a box `longest` times as large as the template's is
-    drawn again.
+    A member is drawn again if it folds, if its cells become too poor, or if it leaves a box `longest` times as large as
+    the template's.
 
     Args:
         size: range of the factor on all lengths.
-        aspect: range of the stretch along each of the three directions, which together keep the volume.
+        aspect: range of the stretches along the three directions, normalised to keep the volume.
         thickness: range of the factor along the approach.
         curvature: largest curvature of the bend towards or against the approach [1/m].
         edge: largest change of the outline seen along the approach, as a share of the distance from its middle.
@@ -639,7 +637,7 @@ class Family:
         bump_width: range of their standard deviation [m].
         quality_share: least radius ratio of each tet over that of the same tet of the template.
         train, validation, test: number of members of each split.
-        entropy: of the random numbers; another one gives other members.
+        entropy: of the random numbers; another value gives other members.
     """
 
     size: Range = (1.0, 1.0)
@@ -672,12 +670,12 @@ class Family:
 
     @property
     def longest(self) -> float:
-        """Factor on the sides of the template's box within which every member stays."""
+        """Factor on the sides of the template's box for the box of all members."""
         return self.size[1] * max(self.aspect[1], self.thickness[1])
 
     def member_count(self, split: str) -> int:
         """Number of members of a split, one of SPLITS."""
-        return {"train": self.train, "validation": self.validation, "test": self.test}[split]
+        return getattr(self, split)
 
 
 @dataclass(frozen=True)
@@ -691,27 +689,27 @@ class Scene:
         mesh: source of the organ's tets.
         material: of the healthy tissue.
         damping: of the organ.
-        anchors: places where the organ is held.
+        anchors: supports of the organ by fixed nodes or elastic tissue.
         contact: between tissue and instruments.
         instrument: the tool, its tip and its approach.
         timing: of haptic and control steps.
         limits: of forces.
         sensor: of forces on the tool.
         palpation: of the palpable face and presses on it.
-        lesion: ranges of the lesion that an episode hides.
-        retract: ranges from which a retraction is drawn.
+        lesion: ranges of an episode's hidden lesion.
+        retract: ranges of a retraction's episodes.
         capsule: on the organ's boundary.
-        demonstration: lesions that the scene shows.
+        demonstration: lesions of the scene file.
         stiffness_rule: one of msdm_core.material.stiffness.STIFFNESS_RULES.
-        port: where an arm enters the body; None: `instruments.arm.arm_instrument.default_port` finds one.
+        port: of an arm; None: that of `instruments.arm.arm_instrument.default_port`.
         ports: those of two arms, the left one's first.
         endoscope: camera of retractions.
         gravity: [m/s^2]; the organ is settled under it onto anchors and supports.
-        supports: solids on which the organ rests, with the contact law of `contact`.
+        supports: solids below the organ, with the contact law of `contact`.
         regions: of the mesh, with materials of their own.
-        retract_scene: file of the scene in which this organ is retracted.
-        retract_refusal: why this organ cannot be retracted.
-        motions: of what holds the organ, in every episode.
+        retract_scene: file of this organ's retraction scene.
+        retract_refusal: reason against retracting this organ.
+        motions: of anchors, foundations and supports, in each episode.
         cranial: direction of the patient's head.
         family: makes the organ the template of many; None: it is one organ.
     """
@@ -752,5 +750,5 @@ class Scene:
 
     @property
     def has_breath(self) -> bool:
-        """Whether a motion rests while the breath is held."""
-        return any(one.stops_in_apnoea for one in self.motions)
+        """True if a motion rests while the breath is held."""
+        return any(motion.stops_in_apnoea for motion in self.motions)

@@ -1,4 +1,4 @@
-"""Presets of how a patient moves, from the library in `scenes/motions`: each becomes motions of a scene."""
+"""Presets of a patient's motion, from the library in `scenes/motions`."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,23 +6,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
-from surgsim_env.scene.load import fill, nearest, read_toml, scenes_folder
+from surgsim_env.scene.load import file_names, fill, nearest, read_toml, scenes_folder
 from surgsim_env.scene.model import CyclicMotion, Range, Scene, Vector
 
-# The preset of a patient who holds still.
+# Preset without motion.
 STILL = "none"
-# Less of the approach than this share across the patient's axis tells no front.
+# Smallest share of the approach across the patient's axis that defines the front.
 ACROSS_LEAST = 0.1
 
 
 @dataclass(frozen=True)
 class PatientMotion:
-    """A cyclic motion by the patient's directions.
+    """Cyclic motion in the patient's directions.
 
     Args:
         name: as "breathing".
         caudal, anterior: displacement towards the feet and towards the front, of a cycle of size 1 [m].
-        cranial_reach: distance [m] from the organ's end nearest to the head up to which it moves; infinite: all of it.
+        cranial_reach: length of the moving part from the organ's end nearest to the head [m]; infinite: all of it.
         period, rise, fall, size, variation, stops_in_apnoea: as of a `CyclicMotion`.
     """
 
@@ -38,10 +38,10 @@ class PatientMotion:
     stops_in_apnoea: bool = False
 
     def within(self, scene: Scene) -> CyclicMotion:
-        """The motion in the axes of a scene: the head is where `cranial` points, the front where the probe comes from.
+        """Motion in the axes of a scene: `cranial` points to the head, the probe comes from the front.
 
-        Of the approach only what is perpendicular to `cranial` counts; a probe along the patient's axis shows no front,
-        and the part towards it is left out.
+        Only the part of the approach normal to `cranial` counts; a probe along the patient's axis defines no front, and
+        the anterior part of the motion is left out.
         """
         cranial = np.array(scene.cranial) / norm(scene.cranial)
         approach = np.array(scene.instrument.approach) / norm(scene.instrument.approach)
@@ -65,7 +65,7 @@ class PatientMotion:
 
 @dataclass(frozen=True)
 class MotionPreset:
-    """A file of `scenes/motions`: what it describes, where its numbers come from, and the motions."""
+    """File of `scenes/motions`: a description, the source of its numbers, and the motions."""
 
     description: str
     source: str
@@ -74,14 +74,14 @@ class MotionPreset:
 
 def list_motions() -> list[str]:
     """Names of the presets; "none" is the first."""
-    return [STILL, *sorted(path.stem for path in (scenes_folder() / "motions").glob("*.toml"))]
+    return [STILL, *file_names("motions")]
 
 
 def make_motion(name: str) -> MotionPreset:
-    """The preset of a name.
+    """Preset of a name.
 
     Raises:
-        ValueError: an unknown name (lists the known, suggests the nearest).
+        ValueError: an unknown name (lists the known ones, suggests the nearest).
     """
     known = list_motions()
     if name not in known[1:]:
@@ -91,10 +91,10 @@ def make_motion(name: str) -> MotionPreset:
 
 
 def with_motion(scene: Scene, name: str | None) -> Scene:
-    """A scene whose patient moves as a preset says; "none": holds still; None: moves as the scene says itself."""
+    """Scene with a preset of the patient's motion; "none": without motion; None: with its own."""
     if name is None:
         return scene
-    motions = () if name == STILL else tuple(one.within(scene) for one in make_motion(name).motions)
+    motions = () if name == STILL else tuple(motion.within(scene) for motion in make_motion(name).motions)
     return replace(scene, motions=motions)
 
 

@@ -1,4 +1,4 @@
-"""The palpable part of an organ's surface: points, normals, rasters, random places; whether its cells are felt."""
+"""Palpable part of an organ's surface: points, normals, rasters, random places, influence of the cell size."""
 
 import math
 import warnings
@@ -16,20 +16,20 @@ from msdm_core.mesh.surface import node_normals
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.scene.model import PalpationSettings
 
-# A point is open if the face over it is higher by at most this [m]: rounding.
+# Rounding error of heights of the face [m].
 OPEN_GAP = 1e-6
 
-# Radius of the probe's shaft [m], which points along the approach; the share of the tip's radius that must be free of
-# tissue around its centre when it touches a site.
+# Radius of the probe's shaft along the approach [m], and the share of the tip's radius to be free of other tissue
+# around its centre on a site.
 SHAFT_RADIUS, TIP_FREE = 0.004, 0.8
 
-# A ray that starts on the surface meets its own triangle nearer than this [m].
+# Largest distance of a ray's hit on its own starting triangle [m].
 HIT_LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class PalpableFace:
-    """The surface triangles that face the instrument.
+    """Surface triangles facing the instrument.
 
     Fields:
         points, normals: surface nodes' positions [m] and unit outward normals                      (n_node, 3)
@@ -39,8 +39,8 @@ class PalpableFace:
         thickness: organ below each triangle along its inward normal [m]                            (n_face,)
         margin: least distance of raster sites from the rim [m]
         thickness_smallest: least thickness of the organ below a site [m]
-        solid: points of the organ's whole surface: nodes, middles of edges and triangles [m]        (n_solid, 3)
-        tip_radius: of the tip that presses [m]
+        solid: nodes, middles of edges and of triangles of the organ's whole surface [m]             (n_solid, 3)
+        tip_radius: of the pressing tip [m]
     """
 
     points: FloatArray
@@ -55,7 +55,7 @@ class PalpableFace:
     tip_radius: float
 
     def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """The face's point nearest to a point [m] and the unit outward normal there, each (3,)."""
+        """Point of the face nearest to a point [m] and the unit outward normal there, each (3,)."""
         return self._at(*self._nearest(np.asarray(point, dtype=np.float64)))
 
     @cached_property
@@ -68,7 +68,7 @@ class PalpableFace:
         return matmul(weights, self.points[nodes]), normal / norm(normal)
 
     def carried(self, point: ArrayLike, other: "PalpableFace") -> FloatArray:
-        """Where a point [m] (3,) of this face is on that of another member of its family, of the same triangles."""
+        """Point [m] (3,) of this face mapped to the face of another member of its family, with the same triangles."""
         face, weights = self._nearest(np.asarray(point, dtype=np.float64))
         return matmul(weights, other.points[other.triangles[face]])
 
@@ -87,13 +87,13 @@ class PalpableFace:
 
     @cached_property
     def _cumulative_area(self) -> FloatArray:
-        """Twice the area of each triangle and all before it [m^2], shape (n_face,)."""
+        """Twice the cumulative area of the triangles [m^2], shape (n_face,)."""
         corners = self.points[self.triangles]
         area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         return np.cumsum(area)
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
-        """A point drawn uniformly over the open face, thick and rim_distance [m] from its border, with its normal.
+        """Draw a point and its normal, uniformly over the open, thick face at least `rim_distance` [m] from its border.
 
         Raises:
             ValueError: no such point in 1000 draws.
@@ -111,13 +111,13 @@ class PalpableFace:
         )
 
     def random_points(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points drawn uniformly over the face [m], normals, each (count, 3), and thickness below [m] (count,)."""
+        """Draw points uniformly over the face [m], normals, each (count, 3), and thickness below [m] (count,)."""
         places = [self._random_place(rng) for _ in range(count)]
         points, normals = zip(*(self._at(*place) for place in places), strict=True)
         return np.array(points), np.array(normals), self.thickness[[face for face, _ in places]]
 
     def _random_place(self, rng: np.random.Generator) -> tuple[int, FloatArray]:
-        """A triangle and barycentric weights (3,) in it, uniformly over the face."""
+        """Draw a triangle and barycentric weights (3,) in it, uniformly over the face."""
         cumulative = self._cumulative_area
         face = int(np.searchsorted(cumulative, rng.random() * cumulative[-1]))
         u, v = rng.random(2)
@@ -126,13 +126,13 @@ class PalpableFace:
 
     @cached_property
     def _plane(self) -> tuple[FloatArray, FloatArray]:
-        """The triangles' corners projected across the approach (n_face, 3, 2), and their heights (n_face, 3) [m]."""
+        """Corners of the triangles projected along the approach (n_face, 3, 2), and their heights (n_face, 3) [m]."""
         across, along = tangent_axes(self.approach)
         corners = self.points[self.triangles]
         return np.stack([matmul(corners, across), matmul(corners, along)], axis=2), matmul(corners, -self.approach)
 
     def drop(self, u: float, v: float) -> tuple[FloatArray, FloatArray] | None:
-        """The uppermost point of the face over a point of the plane of `tangent_axes` [m], and its normal, each (3,).
+        """Uppermost point of the face over a point of the plane of `tangent_axes` [m], and its normal, each (3,).
 
         None outside the face.
         """
@@ -140,15 +140,16 @@ class PalpableFace:
         return None if hit is None else self._at(*hit)
 
     def is_open(self, point: FloatArray) -> bool:
-        """Whether nothing of the face lies above a point of it [m] (3,), so that a straight tool gets there."""
+        """True if no part of the face is above its point [m] (3,): a straight tool reaches it."""
         u, v = (float(matmul(point, axis)) for axis in tangent_axes(self.approach))
         top = self.drop(u, v)
         return top is None or float(matmul(top[0] - point, -self.approach)) <= OPEN_GAP
 
     def site(self, u: float, v: float, *, slack: float = 0.0) -> tuple[FloatArray, FloatArray] | None:
-        """`drop`, but None also where no tool may press.
+        """Pressable point of the face over a point of the plane, as in `drop`, or None.
 
-        That is where the organ is thin, the border nearer than the margin less a slack [m], or other tissue in the way.
+        A point is not pressable over a thin organ, nearer to the border than the margin less a slack [m], or with other
+        tissue in the way.
         """
         hit = _drop(*self._plane, u, v)
         if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
@@ -159,16 +160,16 @@ class PalpableFace:
         return point, normal
 
     def is_clear(self, point: FloatArray, normal: FloatArray) -> bool:
-        """Whether a tip that touches the face at a point [m] (3,), and its shaft, touch the organ nowhere else."""
+        """True if a tip on the face at a point [m] (3,), and its shaft, touch no other part of the organ."""
         away = self.solid - (point + self.tip_radius * normal)
         along, square = matmul(away, -self.approach), (away * away).sum(axis=1)
         in_shaft = (along > 0.0) & (square - (along * along) < (SHAFT_RADIUS * SHAFT_RADIUS))
         return not (in_shaft | (square < np.square(TIP_FREE * self.tip_radius))).any()
 
     def raster(self, spacing: float) -> tuple[FloatArray, FloatArray]:
-        """Points on a square grid seen along the approach, dropped onto the face, and their normals, each (n_site, 3).
+        """Points of a square grid projected along the approach onto the face, and their normals, each (n_site, 3).
 
-        Points that may not be pressed (`site`) are left out.
+        Points without a `site` are left out.
         """
         plane = self._plane[0]
         lower, upper = plane.min(axis=(0, 1)), plane.max(axis=(0, 1))
@@ -180,7 +181,7 @@ class PalpableFace:
 def find_palpable_face(
     mesh: TetMesh, approach: ArrayLike, palpation: PalpationSettings, tip_radius: float
 ) -> PalpableFace:
-    """The surface triangles whose inward normal is within the scene's angle of the approach direction.
+    """Surface triangles with an inward normal within the scene's angle of the approach.
 
     Args:
         mesh: of the organ.
@@ -195,16 +196,16 @@ def find_palpable_face(
     direction = direction / norm(direction)
     triangles = mesh.boundary_triangles
     unit = _unit_normals(mesh.points[triangles])
-    chosen = matmul(-unit, direction) >= float(cos(math.radians(palpation.face_angle_deg)))
-    if not chosen.any():
+    facing = matmul(-unit, direction) >= float(cos(math.radians(palpation.face_angle_deg)))
+    if not facing.any():
         raise ValueError("no part of the organ's surface faces the approach direction: turn instrument.approach")
-    return _face_of(mesh, chosen, direction, palpation, tip_radius)
+    return _face_of(mesh, facing, direction, palpation, tip_radius)
 
 
 def moved_face(face: PalpableFace, mesh: TetMesh, palpation: PalpationSettings) -> PalpableFace:
-    """The same triangles as a palpable face where its organ's nodes are moved to other places (`TetMesh.moved`)."""
-    wanted = {tuple(one) for one in face.triangles.tolist()}
-    chosen = np.array([tuple(one) in wanted for one in mesh.boundary_triangles.tolist()], dtype=np.bool_)
+    """Palpable face of the same triangles on a moved mesh (`TetMesh.moved`)."""
+    triangles = set(map(tuple, face.triangles.tolist()))
+    chosen = np.array([tuple(nodes) in triangles for nodes in mesh.boundary_triangles.tolist()], dtype=np.bool_)
     return _face_of(mesh, chosen, face.approach, palpation, face.tip_radius)
 
 
@@ -215,7 +216,7 @@ def _face_of(
     palpation: PalpationSettings,
     tip_radius: float,
 ) -> PalpableFace:
-    """The palpable face of some of the boundary triangles, (n_triangle,), against a unit approach (3,)."""
+    """Palpable face of the chosen boundary triangles (n_triangle,), against a unit approach (3,)."""
     triangles = mesh.boundary_triangles
     corners = mesh.points[triangles]
     unit = _unit_normals(corners)
@@ -248,13 +249,13 @@ def _unit_normals(corners: FloatArray) -> FloatArray:
 
 
 def _middles(corners: FloatArray) -> list[FloatArray]:
-    """Middles of the edges and of the triangles with given corners (n, 3, 3) [m], four arrays (n, 3)."""
+    """Middles of the edges and of triangles with given corners (n, 3, 3) [m], four arrays (n, 3)."""
     edges = [0.5 * (corners[:, side] + corners[:, side - 1]) for side in range(3)]
     return [*edges, corners.mean(axis=1)]
 
 
 def tangent_axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors across a direction, the first as near to world x (else y) as possible."""
+    """Two unit vectors normal to a direction, the first as near to world x (else y) as possible."""
     start = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     first = start - matmul(start, direction) * direction
     first /= norm(first)
@@ -275,7 +276,7 @@ def _grid(lower: FloatArray, upper: FloatArray, spacing: float) -> FloatArray:
 
 
 def _drop(plane: FloatArray, height: FloatArray, u: float, v: float) -> tuple[int, FloatArray] | None:
-    """The uppermost triangle over a point of the projection plane, with the barycentric weights there."""
+    """Uppermost triangle over a point of the projection plane, with the barycentric weights there."""
     a, b, c = plane[:, 0], plane[:, 1], plane[:, 2]
     determinant = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     wb = ((u - a[:, 0]) * (c[:, 1] - a[:, 1]) - (v - a[:, 1]) * (c[:, 0] - a[:, 0])) / determinant
@@ -312,31 +313,22 @@ def hertz_force(material: Material, tip_radius: float, press_depth: float) -> fl
 
 
 def hidden_share(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> float:
-    """What contact hides of a contrast over 1, as a share, for a press that feels a force over the lesion [N].
+    """Share of a contrast's excess over 1 that compliant contact hides from a press with a force over the lesion [N].
 
-    Under the middle of the tip the tissue gives way to p0 / k_p, where p0 = 3 F / (2 pi R d) (Hertz 1881); a force that
+    Below the middle of the tip the contact yields by p0 / k_p, with p0 = 3 F / (2 pi R d) (Hertz 1881); a force that
     grows as d^1.5 falls by 1.5 p0 / (k_p d) = 9 F / (4 pi k_p R d^2): the stiffness F / d of the tissue over that of
-    contact under the tip. The force of a press elsewhere falls in proportion to itself, so that a contrast C loses this
+    contact under the tip. The force of a press elsewhere falls in proportion to itself, so a contrast C loses this
     share of C - 1. Finite elements lose 0.7 to 1.3 of it (`surgsim validate`, rows "hidden by contact").
     """
     return 2.25 * force / (math.pi * contact_stiffness * tip_radius * (press_depth * press_depth))
 
 
-def hidden_text(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> str:
-    """`hidden_share` in words, for the reports."""
-    share = hidden_share(force, tip_radius, press_depth, contact_stiffness)
-    return (
-        f"contact hides about {share:.1%} of the contrast over 1 where a press feels {force:.2f} N: "
-        f"9 F / (4 pi k_p R d^2) with k_p {contact_stiffness:.3g} N/m^3"
-    )
-
-
-def warn_of_coarse_cells(what: str, cell: float, tip_radius: float, press_depth: float) -> None:
-    """Warn if the mesh itself would be felt."""
+def warn_of_coarse_cells(owner: str, cell: float, tip_radius: float, press_depth: float) -> None:
+    """Warn if the cells are so coarse that the mesh itself would be felt."""
     radius = contact_radius(tip_radius, press_depth)
     if cell > SHARE_LARGEST * radius:
         warnings.warn(
-            f"{what}: cell / contact radius is {share_text(cell, tip_radius, press_depth)}; use cells of at most "
+            f"{owner}: cell / contact radius is {share_text(cell, tip_radius, press_depth)}; use cells of at most "
             f"{radius * 1e3:.3g} mm, a larger tip or a deeper press",
             stacklevel=2,
         )

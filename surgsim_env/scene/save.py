@@ -1,4 +1,4 @@
-"""Scenes and arms as the text of TOML files, written from the dataclasses' fields, so that no field can be left out."""
+"""Scenes and arms written as TOML from the dataclasses' fields, so none can be left out."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -11,25 +11,25 @@ from tomlkit.items import AbstractTable, Item, Table
 from surgsim_env.scene.arm_description import ArmDescription
 from surgsim_env.scene.model import Ball, Box, Scene, Side
 
-# A file's own name and folder, which it does not state.
+# Fields from the file's own path, not written.
 PATH_FIELDS = ("name", "folder")
-# Tables that are written on one line.
+# Tables written on one line.
 INLINE_TABLES = (Box, Ball, Side)
-# Comments begin here [characters], or behind an entry that is longer.
+# Column of comments [characters]; longer entries push them back.
 COMMENT_COLUMN = 23
 
 
 def scene_toml(scene: Scene, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None) -> str:
-    """A scene as TOML; `scene_from_table` reads an equal one.
+    """TOML of a scene; `scene_from_table` reads an equal one.
 
     Args:
         scene: to be written.
         head: comment lines at the top.
         comments: texts by the path of their entry or table, such as "contact.stiffness" or "regions[0].material";
-            "regions.material" is for each of the regions.
+            "regions.material" is for all regions.
 
     Raises:
-        ValueError: a field is None while its default is not (TOML has no null).
+        ValueError: a field is None, unlike its default (TOML has no null).
     """
     return _toml(scene, head, comments or {})
 
@@ -37,7 +37,7 @@ def scene_toml(scene: Scene, *, head: Sequence[str] = (), comments: Mapping[str,
 def arm_toml(
     description: ArmDescription, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """An arm's description as TOML; `read_description` reads an equal one.
+    """TOML of an arm's description; `read_description` reads an equal one.
 
     Args:
         description: to be written.
@@ -56,31 +56,33 @@ def _toml(values: Scene | ArmDescription, head: Sequence[str], comments: Mapping
 
 
 def _fill(table: tomlkit.TOMLDocument | AbstractTable, values: Any, path: str, comments: Mapping[str, str]) -> None:
-    """Add all fields of a dataclass to the table at a path of the document."""
-    found = [(one, getattr(values, one.name)) for one in fields(values) if path or one.name not in PATH_FIELDS]
+    """Add the fields of a dataclass to the table at a path of the document."""
+    entries = [
+        (entry, getattr(values, entry.name)) for entry in fields(values) if path or entry.name not in PATH_FIELDS
+    ]
     # TOML wants a table's entries before its sub-tables.
-    for one, value in sorted(found, key=lambda pair: _is_table(pair[1])):
-        if value in (None, (), {}) and value == _default(one):
+    for entry, value in sorted(entries, key=lambda pair: _is_table(pair[1])):
+        if value in (None, (), {}) and value == _default(entry):
             continue
         if value is None:
-            raise ValueError(f"{path}{one.name} is None, which TOML cannot hold; its default is {_default(one)!r}")
-        table.add(one.name, _item(one.name, value, f"{path}{one.name}", comments))
+            raise ValueError(f"{path}{entry.name} is None, which TOML cannot hold; its default is {_default(entry)!r}")
+        table.add(entry.name, _item(entry.name, value, f"{path}{entry.name}", comments))
 
 
 def _item(name: str, value: Any, path: str, comments: Mapping[str, str]) -> Item:
-    """The item of one field, with its comment."""
+    """TOML item of a field, with its comment."""
     if _is_tables(value):
         array = tomlkit.aot()
-        for number, one in enumerate(value):
-            array.append(_item(name, one, f"{path}[{number}]", comments))
+        for number, row in enumerate(value):
+            array.append(_item(name, row, f"{path}[{number}]", comments))
         return array
     if is_dataclass(value):
         item = tomlkit.inline_table() if isinstance(value, INLINE_TABLES) else tomlkit.table()
         _fill(item, value, f"{path}.", comments)
     elif isinstance(value, dict):
         item = tomlkit.table()
-        for key, one in value.items():
-            item.add(key, _plain(one))
+        for key, part in value.items():
+            item.add(key, _plain(part))
     else:
         item = tomlkit.item(_plain(value))
     plain = re.sub(r"\[\d+\]", "", path)
@@ -103,15 +105,15 @@ def _is_table(value: Any) -> bool:
     )
 
 
-def _default(one: Field) -> Any:
-    return one.default if one.default_factory is MISSING else one.default_factory()
+def _default(entry: Field) -> Any:
+    return entry.default if entry.default_factory is MISSING else entry.default_factory()
 
 
 def _plain(value: Any) -> Any:
-    """A value as TOML holds it: tuples as lists."""
-    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+    """Value with tuples as lists, for TOML."""
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
 
 
 def _printable(text: str) -> str:
-    """One line without control characters, as a TOML comment must be."""
-    return "".join(one if one.isprintable() else " " for one in text)
+    """Text without control characters, for a TOML comment."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)

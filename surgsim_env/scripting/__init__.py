@@ -1,4 +1,4 @@
-"""Scripted episodes: steps such as MoveTo and PressUntil, run in an environment, give a Trace in newtons."""
+"""Scripted episodes: steps such as MoveTo and PressUntil, run in an environment and recorded in a Trace."""
 
 from surgsim_env.scripting.motion_file import TIP_PREFIX, motion_columns, read_motion
 from surgsim_env.scripting.observations import selected_observations, stacked_observations

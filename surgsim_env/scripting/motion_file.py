@@ -1,4 +1,4 @@
-"""CSV files of the motion of hands: a header, then one row of numbers per time."""
+"""CSV files of hand motions: a header, then a row of numbers for each time."""
 
 import csv
 from collections.abc import Iterator, Sequence
@@ -9,18 +9,18 @@ import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 
-# Of a pose: 31 bits, so that they fit into any integer type.
+# Largest button mask: 31 bits fit any integer type.
 BUTTONS_LARGEST = 2**31 - 1
-# Names of the columns with the tip's place [m], which recordings of `surgsim view` have.
+# Prefix of the columns of the tip's position [m] in recordings of `surgsim view`.
 TIP_PREFIX = "tip_"
 
 
 class Motion(NamedTuple):
-    """The motion of a hand.
+    """Motion of a hand.
 
     Fields:
         time: of each row, increasing [s]                                          (n,)
-        position: [m]; three times nan in a row without a pose                     (n, 3)
+        position: [m]; NaN in rows without a pose                                  (n, 3)
         buttons: one bit each; 0 without a column                                  (n,)
     """
 
@@ -44,7 +44,7 @@ def read_motion(path: Path, mark: str = "", *, of_tip: bool = False) -> Motion:
 
     Raises:
         ValueError: a missing column, a row that is not numeric or not finite, times that do not increase, invalid
-            buttons, or no rows; names the file and the line or the row.
+            buttons, or no rows; names the file and the line or row.
         OSError: the file cannot be read.
     """
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
@@ -86,7 +86,7 @@ def _check(motion: Motion, file_name: str) -> None:
 
 
 def _rows(reader: csv.DictReader, columns: Sequence[str], file_name: str) -> Iterator[list[float]]:
-    """The numbers of each row."""
+    """Numbers of each row."""
     for row in reader:
         line = reader.line_num
         try:

@@ -1,4 +1,4 @@
-"""Oracles: scripts that know the truth and solve each task, as a bound on what an environment allows."""
+"""Oracles: scripts with knowledge of the truth, an upper bound for each task."""
 
 import math
 from collections.abc import Callable
@@ -31,36 +31,36 @@ from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.retract import RetractTask, lifted_box
 
-# The oracle presses with this share of the soft force limit.
+# Force of the oracle's press over the soft force limit.
 GENTLE_SHARE = 0.4
-# Between the tip ball and the tissue while it moves sideways, and where a press begins [m].
+# Gap between the tip ball and the tissue in sideways motion, and before a press [m].
 TRAVEL_GAP = 0.004
-# Control steps for which enough of the target has to be visible before the lobe is carried no farther.
+# Control steps with enough of the target visible before the fold stops.
 SEEN_STEPS = 5
-# Tissue this far beside the ball's path counts as under it [m].
+# Width beside the ball's path that counts as under it [m].
 CORRIDOR = 0.004
 
-# Grasping an edge. Depth to which the middle of the pads goes over the edge, and distance before it at which the jaw
-# waits [m]; closest approach of the jaw to a support, and reach of its pads beyond the tip [m]; grip force at which the
-# jaw counts as closed [N]; speed of the approach [m/s].
+# Grasp of an edge. Depth of the middle of the pads over the edge, and distance of the waiting jaw before the edge
+# [m]; smallest gap of the jaw to a support, and reach of its pads beyond the tip [m]; grip force of a closed jaw [N];
+# speed of the approach [m/s].
 GRASP_DEPTH, WAITING_GAP = 0.0065, 0.016
 SUPPORT_GAP, PAD_REACH = 0.001, 0.008
 GRIP_FORCE, APPROACH_SPEED = 0.25, 0.015
-# Direction from the held edge to the free one.
+# Direction from the held to the free edge.
 OUTWARD = np.array([0.0, 1.0, 0.0])
 
-# Folding a lobe. Waypoints of the tip in y and z as shares of the lobe's depth, first up, then over; rotation of the
-# edge on each of the two ways [rad]; speed [m/s].
+# Fold of a lobe. Waypoints of the tip in y and z as shares of the lobe's depth, first up, then over; rotation of the
+# edge on each of the two motions [rad]; speed [m/s].
 RISEN, FOLDED = (0.88, 0.50), (0.46, 0.84)
 TURNS = (math.radians(35.0), math.radians(40.0))
 CARRYING_SPEED = 0.015
 
-# Lifting a flap. Height [m] and speed [m/s] of the lift. A wedge of tissue that is pulled straight up moves outward by
-# OUTWARD_SHARE and turns by TURN_RATE [rad/m] for each metre up; the jaw follows, so that it does not pull on it.
+# Lift of a flap. Height [m] and speed [m/s] of the lift. A wedge of tissue pulled straight up moves outward by
+# OUTWARD_SHARE and turns by TURN_RATE [rad/m] for each metre up; the jaw follows, without a pull.
 FLAP_LIFT, FLAP_SPEED = 0.025, 0.006
 OUTWARD_SHARE, TURN_RATE = 0.25, 30.0
 # Clearance in the open jaw at its narrowest [m]; spacing of the section's lines along y, and the thickness below which
-# the edge is skipped [m]; friction reserve at which the jaw stops [N].
+# the edge is skipped [m]; smallest friction reserve of the jaw [N].
 JAW_PLAY, SECTION_STEP, THIN, FRICTION_KEPT = 0.002, 0.0005, 0.001, 0.06
 
 # Two arms. Offset of the left jaw from the target along x, away from the right arm [m]; shares of the fold and of the
@@ -69,24 +69,23 @@ BESIDE, FOLD_SHARE, LIFT_SHARE = -0.008, 0.66, 0.7
 # Waypoints of the right tip [m]: before the lobe (from the target in x, from the free edge in y, height), at its mouth
 # (from the target in x and y, height), over the target (free height).
 BEFORE, MOUTH, OVER = (0.010, 0.018, 0.022), (0.002, 0.012, 0.010), 0.0005
-# It touches the target this share of its radius nearer to the free edge than its middle, where the lobe hangs higher.
+# Offset of the touch from the target's middle towards the free edge, under the higher part of the lobe, in radii.
 OUTER_SHARE = 0.85
-# Force on the target [N], the middle of the range that counts as a touch, and speed [m/s].
+# Force on the target [N], the middle of the range of a touch, and speed [m/s].
 PRESSING_FORCE, REACHING_SPEED = 0.6, 0.015
 
 
 def oracle_script(env: gym.Env, *, tracks: bool = False) -> list[Step]:
-    """The script that solves this episode from the environment's present state; reset the environment first.
+    """Script that solves the current episode from the environment's present state; reset the environment first.
 
-    A task of a user's own declares its oracle as a method `oracle(simulation)` that returns the steps.
+    A task of a user's own has an oracle as a method `oracle(simulation)` that returns the steps.
 
     Args:
-        env: that the script will play.
-        tracks: each step goes with the surface that moves, as markers show it (`Tracked`); else it goes where its
-            points are at rest.
+        env: for the script.
+        tracks: each step follows the moving surface by its markers (`Tracked`); else it goes to its points at rest.
 
     Raises:
-        ValueError: nothing was reset yet, or no oracle is known for the environment.
+        ValueError: the environment was not reset, or has no known oracle.
     """
     steps = _oracle_steps(env)
     if not tracks:
@@ -99,7 +98,7 @@ def oracle_script(env: gym.Env, *, tracks: bool = False) -> list[Step]:
 
 
 def markers(anatomy: Anatomy) -> IntArray:
-    """The nodes that a script watches to track the surface: of the palpable face, or what holds a lifted lobe."""
+    """Nodes for tracking of the surface: of the palpable face, or the held nodes of a lifted lobe."""
     if anatomy.scene.retract is None:
         return np.unique(anatomy.face.triangles)
     return anatomy.anchors if len(anatomy.anchors) else anatomy.foundation_nodes
@@ -123,7 +122,7 @@ def _oracle_steps(env: gym.Env) -> list[Step]:
 
 
 def palpate_oracle(task: PalpateTask, simulation: Simulation) -> list[Step]:
-    """Rise, go over the lesion, press gently along the surface's normal, hold and declare."""
+    """Rise, move over the lesion, press gently along the surface's normal, hold and declare."""
     lesion, anatomy = task.lesion, simulation.anatomy
     assert lesion is not None and lesion.centre is not None
     scene, approach = anatomy.scene, anatomy.face.approach
@@ -135,8 +134,8 @@ def palpate_oracle(task: PalpateTask, simulation: Simulation) -> list[Step]:
     return [
         MoveTo(_at_height(start, approach, height), timeout=10.0, name="rise"),
         MoveTo(_at_height(above, approach, height), timeout=20.0, name="go over"),
-        MoveTo(tuple(above.tolist()), timeout=10.0, name="come down"),
-        PressUntil(force, 2.0 * scene.palpation.press_depth, direction=tuple((-normal).tolist()), name="press"),
+        MoveTo(_point(above), timeout=10.0, name="come down"),
+        PressUntil(force, 2.0 * scene.palpation.press_depth, direction=_point(-normal), name="press"),
         Hold(0.1, name="hold"),
         Declare(name="declare"),
     ]
@@ -152,7 +151,7 @@ def retract_oracle(task: RetractTask, simulation: Simulation) -> list[Step]:
 
 
 def bimanual_oracle(task: BimanualRetractTask, simulation: Simulation) -> list[Step]:
-    """Fold the lobe back with the left arm, however much is seen; reach under it with the right one and press."""
+    """Fold the lobe back with the left arm, regardless of visibility; reach under it with the right arm and press."""
     assert task.target is not None
     target, radius = task.target.centre, simulation.anatomy.scene.instrument.tip_radius
     edge = float(simulation.organ_model.node_rest_position[:, 1].max())
@@ -170,7 +169,7 @@ def bimanual_oracle(task: BimanualRetractTask, simulation: Simulation) -> list[S
     return [*(MayEnd(OfArm(step, "left")) for step in left), *(MayEnd(OfArm(step, "right")) for step in right)]
 
 
-# An oracle for each shipped task.
+# Oracles of the shipped tasks.
 ORACLES: dict[type, Callable[..., list[Step]]] = {
     PalpateTask: palpate_oracle,
     RetractTask: retract_oracle,
@@ -179,7 +178,7 @@ ORACLES: dict[type, Callable[..., list[Step]]] = {
 
 
 def _travel_height(anatomy: Anatomy, start: FloatArray, end: FloatArray) -> float:
-    """Height against the approach [m] at which the tip ball passes over all tissue between two places."""
+    """Height against the approach [m] for the tip ball to pass over all tissue between two places."""
     upward, radius = -anatomy.face.approach, anatomy.scene.instrument.tip_radius
     points = anatomy.mesh.points[anatomy.mesh.boundary_nodes]
     span = _level(end - start, upward)
@@ -196,8 +195,7 @@ def _level(vectors: FloatArray, upward: FloatArray) -> FloatArray:
 
 
 def _at_height(place: FloatArray, approach: FloatArray, height: float) -> tuple[float, float, float]:
-    x, y, z = (place - approach * (height + float(matmul(place, approach)))).tolist()
-    return x, y, z
+    return _point(place - approach * (height + float(matmul(place, approach))))
 
 
 def flap_steps(
@@ -209,15 +207,15 @@ def flap_steps(
     aside: float = 0.0,
     share: float = 1.0,
 ) -> list[Step]:
-    """Grasp the edge of a flap before a target [m] (3,) along the jaw and lift it; the organ as it rests now.
+    """Grasp the edge of a flap before a target along the jaw and lift it.
 
     Args:
         simulation: at rest, the jaw open before the edge.
         target: centre of the disc to expose [m], shape (3,).
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
-        enough: whether the target is seen well enough to lift the edge no farther.
-        aside: how far beside the target the edge is grasped, along x [m].
-        share: of FLAP_LIFT, at most.
+        enough: predicate of sufficient visibility, the end of the lift.
+        aside: offset of the grasp from the target along x [m].
+        share: largest lift over FLAP_LIFT.
     """
     scene, rest = simulation.anatomy.scene, simulation.organ_model.node_rest_position
     assert scene.retract is not None and scene.retract.flap is not None
@@ -225,14 +223,14 @@ def flap_steps(
     box, surface = lifted_box(scene.retract, rest), simulation.anatomy.mesh.boundary_triangles
     free = surface[~np.isin(surface, simulation.anatomy.anchors).all(axis=1)]
     place, sides = edge_section(simulation.organ_state.node_position, free, along, float(box[0][1]))
-    bed = max((float(one.reach(OUTWARD)) for one in scene.supports), default=-math.inf)
+    bed = max((float(support.reach(OUTWARD)) for support in scene.supports), default=-math.inf)
     jaw = np.asarray(scene.instrument.tip_direction or (0.0, -1.0, 0.0))
     jaw = jaw / norm(jaw)
-    # Across the jaw, which points along the middle of the edge.
+    # Thickness across the jaw, which points along the middle of the edge.
     thick = np.ptp(sides, axis=1) * abs(jaw[1])
-    grasped = simulation.grasp
-    assert grasped is not None
-    fits = float(place[thick <= grasped.opening - JAW_PLAY].min(initial=place[0])) + PAD_REACH
+    jaw_state = simulation.grasp
+    assert jaw_state is not None
+    fits = float(place[thick <= jaw_state.opening - JAW_PLAY].min(initial=place[0])) + PAD_REACH
     y = max(float(place[0]) - GRASP_DEPTH, bed + SUPPORT_GAP + PAD_REACH, fits)
     grasp = np.array([along, y, float(np.interp(y, place[::-1], sides.mean(axis=1)[::-1]))])
     waiting = grasp - jaw * (WAITING_GAP + float(place[0]) - y)
@@ -252,7 +250,7 @@ def flap_steps(
 
 
 def _turn(angle: float, size: int) -> float | tuple[float, ...]:
-    """A turn about x in the instrument's own terms; a hinge lifts the jaw's tip above 0, and here it goes down."""
+    """Turn about x in the instrument's own terms, with the opposite sign of a hinge's angle."""
     return (angle, 0.0, 0.0) if size == 3 else -angle * float(size == 1)
 
 
@@ -262,19 +260,19 @@ def _point(place: FloatArray) -> tuple[float, float, float]:
 
 
 def edge_section(nodes: FloatArray, triangles: IntArray, x: float, inner: float) -> tuple[FloatArray, FloatArray]:
-    """Section of an organ across its free edge at a place along it.
+    """Section of an organ across its free edge.
 
     Args:
         nodes: [m], (n_node, 3).
-        triangles: of the surface of what is lifted (n, 3).
+        triangles: of the surface of the lifted part (n, 3).
         x: place along the edge [m].
-        inner: how far inward it is wanted, a place along y [m].
+        inner: innermost place of the section along y [m].
 
     Returns:
-        Places along y where there is tissue, the edge first [m] (n,); its lowest and highest point there [m] (n, 2).
+        Places along y with tissue, the edge first [m] (n,); its lowest and highest point there [m] (n, 2).
 
     Raises:
-        ValueError: nothing is there.
+        ValueError: no tissue there.
     """
     corners = nodes[triangles]
     corners = corners[(corners[:, :, 0].min(axis=1) <= x) & (corners[:, :, 0].max(axis=1) >= x)]
@@ -290,16 +288,16 @@ def edge_section(nodes: FloatArray, triangles: IntArray, x: float, inner: float)
 
 
 def _heights(corners: FloatArray, x: float, y: float) -> FloatArray:
-    """Where a vertical line meets triangles [m] (n, 3, 3), heights (m,)."""
+    """Heights of a vertical line's intersections with triangles [m] (n, 3, 3), shape (m,)."""
     a, b, c = (corners[:, corner] for corner in range(3))
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
     level = np.abs(area) > 1e-15
     a, b, c, area = a[level], b[level], c[level], area[level]
     beta = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (y - a[:, 1])) / area
     gamma = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (x - a[:, 0]) * (b[:, 1] - a[:, 1])) / area
-    met = (beta >= 0.0) & (gamma >= 0.0) & (beta + gamma <= 1.0)
+    inside = (beta >= 0.0) & (gamma >= 0.0) & (beta + gamma <= 1.0)
     height = a[:, 2] + beta * (b[:, 2] - a[:, 2]) + gamma * (c[:, 2] - a[:, 2])
-    return height[met]
+    return height[inside]
 
 
 def retraction_steps(
@@ -312,16 +310,16 @@ def retraction_steps(
     fold: float = 1.0,
     lift: float = 1.0,
 ) -> list[Step]:
-    """Grasp the free edge beside a target [m] (3,) and fold it back; the lobe as it rests now.
+    """Grasp the free edge of a lobe beside a target and fold it back, or lift a flap.
 
     Args:
         simulation: at rest, the jaw open on the free side.
         target: centre of the disc to expose [m], shape (3,).
-        enough: whether the target is seen well enough to carry the lobe no farther.
+        enough: predicate of sufficient visibility, the end of the fold.
         turning_size: entries of the wrist's turning: none, one hinge about x, or a rotation vector.
-        aside: how far beside the target the edge is grasped, along x [m].
-        fold: share of the second way, on which the lifted edge is folded back.
-        lift: of a flap, which is not folded, the share of its one way.
+        aside: offset of the grasp from the target along x [m].
+        fold: share of the second motion, the fold of the lifted edge.
+        lift: share of a flap's lift, in place of the fold.
     """
     table = simulation.anatomy.scene.retract
     if table is not None and table.flap is not None:
@@ -332,7 +330,7 @@ def retraction_steps(
     along = float(target[0]) + aside
     near = edge & (np.abs(rest[:, 0] - along) <= GRASP_DEPTH)
     _, border, height = nodes[near].mean(axis=0).tolist()
-    # How far along y the supports reach that end before the edge [m].
+    # Largest reach along y of the supports that end before the edge [m].
     supports = simulation.anatomy.scene.supports
     reaches = (support.reach(OUTWARD) for support in supports if support.kind != "plane")
     bed = max((reach for reach in reaches if reach < border), default=-math.inf)

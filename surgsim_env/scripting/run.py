@@ -1,4 +1,4 @@
-"""Run a script in an environment and record it."""
+"""Execution and recording of scripts in an environment."""
 
 import copy
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.scripting.observations import stacked_observations
 from surgsim_env.scripting.steps import Action, Control, MayEnd, Script, Step, StepFailed, View
 from surgsim_env.scripting.trace import StepInterval, Trace, contact_depth
-from surgsim_env.tasks.task import Task
+from surgsim_env.tasks.layout import TaskLayout
 
 
 class ScriptError(Exception):
-    """A script did not reach its end: the message names the step; `trace` is the run up to there."""
+    """Failure of a script: the message names the step; `trace` is the run up to there."""
 
     def __init__(self, message: str, trace: Trace) -> None:
         super().__init__(message)
@@ -26,39 +26,39 @@ class ScriptError(Exception):
 
 
 def run_script(env: gym.Env, script: Script, *, seed: int | None = None) -> Trace:
-    """Run the steps of a script one after the other and record everything; recording changes no bit of the episode.
+    """Run the steps of a script in turn and record them, without changing a bit of the episode.
 
-    The episode may end in the last step if that is one of those made for it (Declare, Control, AwaitEnd), and may end
-    in success in a step that allows it (MayEnd), which ends the script. Any other end before the last step is an error;
-    so are a force limit and a fault in any step.
+    The episode may end in the last step if that is one with `ends_episode` (Declare, Control, AwaitEnd), and in success
+    in a MayEnd step, which ends the script. Any other end of the episode is an error; so are a force limit and a fault
+    in any step.
 
     Args:
         env: one environment of this project, wrapped or not.
-        script: steps; those without a name of their own are called after their class, from the second on "Hold 2".
-        seed: resets the environment first; without it the run continues from the environment's present state.
+        script: steps; those without a name are named by their class: "Hold", "Hold 2" and so on.
+        seed: resets the environment first; without it the run continues from the current state.
 
     Raises:
-        ScriptError: a step ran out of time or depth, or the episode ended too soon; its `trace` is the run so far.
-        TypeError: not an environment of this project, several in one, or one whose task scripts cannot command.
-        ValueError: an empty script, two steps of one name, a speed or an action beyond what the environment takes.
+        ScriptError: a step ran out of time or depth, or the episode ended too soon.
+        TypeError: not an environment of this project, a vector environment, or a task without the needed channels.
+        ValueError: an empty script, two steps of one name, a speed or an action beyond the environment's limits.
     """
     inner = _inner(env)
-    task: Task = inner.task
+    layout = inner.layout
     names = _names(script)
     for step, name in zip(script, names, strict=True):
-        if step.speed > task.speed_limit * (1.0 + 1e-9):
+        if step.speed > layout.speed_limit * (1.0 + 1e-9):
             raise ValueError(
-                f"step {name!r}: speed is {step.speed:g} m/s; the tip cannot be told to go faster than "
-                f"{task.speed_limit:g} m/s: ask for that or less"
+                f"step {name!r}: speed is {step.speed:g} m/s; the largest speed of the tip is "
+                f"{layout.speed_limit:g} m/s: use that or less"
             )
     observation = inner.observation if seed is None else env.reset(seed=seed)[0]
     with inner.simulation.recording() as record:
-        run = _Run(env, inner, task, record, observation, inner.simulation.time)
+        run = _Run(env, inner, layout, record, observation, inner.simulation.time)
         failure = ""
         for index, (step, name) in enumerate(zip(script, names, strict=True)):
-            began = inner.simulation.time
-            failure = run.make(step, name, last=index == len(script) - 1)
-            run.steps.append(StepInterval(name, began, inner.simulation.time))
+            start = inner.simulation.time
+            failure = run.play(step, name, last=index == len(script) - 1)
+            run.steps.append(StepInterval(name, start, inner.simulation.time))
             if run.ended:
                 break
             if failure:
@@ -72,11 +72,11 @@ def run_script(env: gym.Env, script: Script, *, seed: int | None = None) -> Trac
 
 @dataclass
 class _Run:
-    """The state of a run, extended in each control step."""
+    """State of a run, extended in each control step."""
 
     env: gym.Env
     inner: SurgicalEnv
-    task: Task
+    layout: TaskLayout
     record: HapticRecord
     observation: Observation
     start: float
@@ -88,13 +88,13 @@ class _Run:
     steps: list[StepInterval] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
-    # Whether the episode ended as the script intended.
+    # True if the episode ended as intended by the script.
     ended: bool = False
 
-    def make(self, step: Step, name: str, *, last: bool) -> str:
-        """Run one step of the script; returns "" or why it failed."""
-        began, first = self.inner.simulation.time, len(self.record)
-        view = self._look(began, first)
+    def play(self, step: Step, name: str, *, last: bool) -> str:
+        """Run a step of the script; returns "" or the reason of its failure."""
+        start, first = self.inner.simulation.time, len(self.record)
+        view = self._look(start, first)
         plan = step.actions(view)
         try:
             action = next(plan)
@@ -102,7 +102,7 @@ class _Run:
                 if view.step_time >= step.timeout - 1e-9:
                     return f"ran out of its {step.timeout:g} s: {step}; {view.reached()}"
                 self._take(action, name, checked=not isinstance(step, Control))
-                view = self._look(began, first)
+                view = self._look(start, first)
                 if self.terminated or self.truncated:
                     harm = self._harm()
                     allowed = last or (isinstance(step, MayEnd) and bool(self.infos[-1].get("success")))
@@ -118,7 +118,7 @@ class _Run:
             plan.close()
 
     def trace(self, failure: str) -> Trace:
-        """The trace of the run so far."""
+        """Trace of the run so far."""
         record, simulation = self.record, self.inner.simulation
         return Trace(
             start=self.start,
@@ -129,7 +129,7 @@ class _Run:
             depth=contact_depth(record.wrench, record.tip_position, simulation.anatomy.face.approach),
             control_time=np.array(self.times),
             observation=stacked_observations(self.env.observation_space, self.observations),
-            action=np.array(self.actions) if self.times else np.zeros((0, self.task.action_size)),
+            action=np.array(self.actions) if self.times else np.zeros((0, self.layout.action_size)),
             reward=np.array(self.rewards),
             infos=tuple(self.infos),
             steps=tuple(self.steps),
@@ -139,24 +139,24 @@ class _Run:
             failure=failure,
         )
 
-    def _look(self, began: float, first: int) -> View:
-        """The view now; the step of the script began at a time [s], with a number of recorded haptic steps."""
-        simulation, touched = self.inner.simulation, self.record.first_contact(first)
+    def _look(self, start: float, first: int) -> View:
+        """Current view, in a step from a time [s] and a number of recorded haptic steps on."""
+        simulation, contact = self.inner.simulation, self.record.first_contact(first)
         instrument = simulation.instrument
         view = View(
             time=simulation.time,
-            step_time=simulation.time - began,
+            step_time=simulation.time - start,
             control_step=simulation.anatomy.scene.timing.control_step,
             observation=copy.deepcopy(self.observation),
             tip_position=instrument.tip_position,
             tip_velocity=instrument.tip_velocity,
             true_force=simulation.contact_force,
-            # As no wrapper or picture has changed it.
-            sensed_force=self.task.sensed_force(self.inner.task_observation),
-            contact_position=None if touched is None else self.record.tip_position_at(touched),
+            # From the task's observation, before wrappers and pictures.
+            sensed_force=self.layout.sensed_force(self.inner.task_observation),
+            contact_position=None if contact is None else self.record.tip_position_at(contact),
             approach=simulation.anatomy.face.approach.copy(),
             grasp=simulation.grasp,
-            task=self.task,
+            layout=self.layout,
         )
         if not isinstance(instrument, Pair):
             return view
@@ -167,8 +167,8 @@ class _Run:
         observation, reward, terminated, truncated, info = self.env.step(values)
         if checked and not np.array_equal(self.inner.last_action, values):
             raise ValueError(
-                f"a wrapper in {self.env} changes the actions of step {name!r}: run the script on the environment "
-                "inside it, or put what the wrapper takes into a Control step"
+                f"a wrapper in {self.env} changes the actions of step {name!r}: run the script in the environment "
+                "inside it, or give the wrapper's own actions in a Control step"
             )
         self.observation = copy.deepcopy(observation)
         self.terminated, self.truncated = bool(terminated), bool(truncated)
@@ -179,7 +179,7 @@ class _Run:
         self.infos.append(dict(info))
 
     def _harm(self) -> str:
-        """The fault, the tear or the force limit that ended the episode; "" for none."""
+        """Fault, tear or force limit at the episode's end; "" for none."""
         info = self.infos[-1]
         if info.get("sim_fault"):
             return f"came to a fault of the simulation ({info['sim_fault']})"
@@ -192,7 +192,7 @@ class _Run:
 
 
 def _of_arm(view: View, simulation: Simulation, pair: Pair, side: str) -> View:
-    """The view as one arm of a pair has it; its force is not sensed apart."""
+    """View of one arm of a pair; its sensed force is the true one."""
     arm, force = pair.arms[side], pair.contact_force(side, simulation.contact_wrench)
     supports = simulation.anatomy.scene.supports
     return replace(
@@ -208,13 +208,13 @@ def _of_arm(view: View, simulation: Simulation, pair: Pair, side: str) -> View:
 
 
 def _inner(env: gym.Env) -> SurgicalEnv:
-    """The environment itself, which a script can command."""
+    """Unwrapped environment, checked for the channels of scripts."""
     if isinstance(env, gym.vector.VectorEnv):
-        raise TypeError("a script runs in one environment, not in several abreast: make one with gym.make")
+        raise TypeError("a script runs in one environment, not in a vector environment: make one with gym.make")
     inner = env.unwrapped
     if not isinstance(inner, SurgicalEnv):
         raise TypeError(f'{type(inner).__name__} is no environment of this project: use gym.make("SurgSim/Palpate-v0")')
-    if "velocity" not in inner.task.action_slices or "contact_force" not in inner.task.observation_slices:
+    if "velocity" not in inner.layout.action_slices or "contact_force" not in inner.layout.observation_slices:
         raise TypeError(
             f"{type(inner.task).__name__} cannot be scripted: steps command `velocity` and sense `contact_force`; "
             "declare a command and a channel of these names"
@@ -223,7 +223,7 @@ def _inner(env: gym.Env) -> SurgicalEnv:
 
 
 def _names(script: Sequence[Step]) -> list[str]:
-    """A name for each step: its own, or its class's, from the second on with a number."""
+    """Name of each step: its own, or its class's, from the second on with a number."""
     if not script:
         raise ValueError("the script is empty; give it at least one step, such as Hold(0.1)")
     names: list[str] = []

@@ -1,4 +1,4 @@
-"""The steps of a script: motions of the tip, presses, the jaw, controllers, steps that wrap others; what they see."""
+"""Steps of a script: motions of the tip, presses, the jaw, controllers, wrappers of steps; their view of a run."""
 
 import copy
 import math
@@ -16,40 +16,40 @@ from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.envs.surgical_env import Observation
 from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.scripting.motion_file import TIP_PREFIX, read_motion
-from surgsim_env.tasks.task import Task
+from surgsim_env.tasks.layout import TaskLayout
 
 Action = NDArray[np.floating]
 
-# Share of the remaining distance that a step commands for one control step: the tip lags behind its command.
+# Largest commanded share of the remaining distance in a control step: the tip lags behind its command.
 APPROACH_GAIN = 0.6
-# A press has used up its depth within this distance of it [m].
+# Distance from the largest depth within which a press counts as at it [m].
 DEPTH_SLACK = 2e-5
-# Stiffness is estimated over motions longer than this [m]: over shorter ones the sensor's noise dominates.
+# Smallest motion for an estimate of stiffness [m]: over shorter ones the sensor's noise dominates.
 TRAVEL_READ = 1e-4
 # Tip speed over the error of the force on a support [m/s per N]: 60 % of it in a control step of 50 ms at 2000 N/m.
 GAIN = 0.006
-# Rate at which a press on a support returns to its place across the press [1/s].
+# Rate of a press's return to its line on a support [1/s].
 HOMING = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A moment of a run, as the steps of its script and their predicates see it.
+    """Current state of a run, for the steps of its script and their predicates.
 
     Fields:
         time: since the episode's reset [s]
-        step_time: since the present step of the script began [s]
+        step_time: since the beginning of the current step of the script [s]
         control_step: duration of a control step [s]
-        observation: as the environment, with its wrappers, gave it
+        observation: of the environment with its wrappers
         tip_position, tip_velocity: centre of the tip ball [m], [m/s]                       (3,)
         true_force: of the tissue on the tools, mean of the last haptic step [N]            (3,)
         sensed_force: the same through the sensor model, as observed [N]                    (3,)
-        contact_position: the tip at the first contact since the step began [m]; None before it  (3,)
-        approach: unit vector along which the instrument comes                              (3,)
-        grasp: what the jaw holds and how; None without a jaw
-        task: how actions are laid out
+        contact_position: the tip at the first contact in the step [m]; None before it  (3,)
+        approach: unit vector of the instrument's approach                                  (3,)
+        grasp: state of the jaw's grasp; None without a jaw
+        layout: of the task's actions
         support_force: of the tool on the organ's supports [N]; for the arms of a pair
-        arm: the arm of a pair whose view this is; "" for both or the only one
+        arm: the viewing arm of a pair; "" for both or the only one
         arms: views of each of several arms, by name
     """
 
@@ -64,35 +64,35 @@ class View:
     contact_position: FloatArray | None
     approach: FloatArray
     grasp: Grasp | None
-    task: Task
+    layout: TaskLayout
     support_force: float = 0.0
     arm: str = ""
     arms: Mapping[str, "View"] = field(default_factory=dict)
 
     def action(self, velocity: FloatArray, **commands: Any) -> Action:
-        """The action that asks for a tip velocity [m/s] (3,), and for what else the task takes (`declare=True`).
+        """Action for a tip velocity [m/s] (3,) and further commands of the task (`declare=True`).
 
-        A jaw stays as it was last told (`jaw=-1.0` closes it); of several arms the others stay where they are.
+        A jaw keeps its last command (`jaw=-1.0` closes it); of several arms the others stand still.
         """
         if self.arm == "right":
             own = {"right": velocity, **{f"right_{name}": value for name, value in commands.items()}}
-            return self.task.action(np.zeros(3), **own)
-        return self.task.action(velocity, **commands)
+            return self.layout.action(np.zeros(3), **own)
+        return self.layout.action(velocity, **commands)
 
     def still(self, **commands: Any) -> Action:
-        """The action that keeps the tip where it is."""
+        """Action for a resting tip."""
         return self.action(np.zeros(3), **commands)
 
     def carried(self, action: Action, velocity: FloatArray) -> Action:
-        """An action with a velocity [m/s] (3,) added to that of each tip, within what an action can ask for."""
+        """Action with a velocity [m/s] (3,) added to that of each tip, within the limits of actions."""
         moved = np.array(action, dtype=np.float64)
-        for name in {"velocity", "right"} & set(self.task.action_slices):
-            part = self.task.action_slices[name]
-            moved[part] = np.clip(moved[part] + self.task.action(**{name: velocity})[part], -1.0, 1.0)
+        for name in {"velocity", "right"} & set(self.layout.action_slices):
+            part = self.layout.action_slices[name]
+            moved[part] = np.clip(moved[part] + self.layout.action(**{name: velocity})[part], -1.0, 1.0)
         return moved
 
     def from_surface(self, shift: FloatArray, contact_shift: FloatArray) -> "View":
-        """The view as seen from a surface that moved by a shift [m] (3,) from rest, and by another at first contact."""
+        """View relative to a surface shifted from rest by `shift` [m] (3,), and by `contact_shift` at first contact."""
         contact = self.contact_position
         return replace(
             self,
@@ -102,7 +102,7 @@ class View:
         )
 
     def grasped(self, step: object) -> Grasp:
-        """What the jaw holds, for a step that needs one.
+        """Grasp of the jaw, for steps of a jaw.
 
         Raises:
             TypeError: the instrument has no jaw.
@@ -114,17 +114,17 @@ class View:
         return self.grasp
 
     def pressing_force(self, direction: FloatArray, *, sensed: bool = False) -> float:
-        """The force with which the tissue pushes back against a unit direction [N], true or sensed."""
+        """Force of the tissue against a unit direction [N], true or sensed."""
         return -float(matmul(self.sensed_force if sensed else self.true_force, direction))
 
     def depth(self, direction: FloatArray) -> float:
-        """How far the tip went along a unit direction since the step's first contact [m]; 0 before it."""
+        """Travel of the tip along a unit direction since the step's first contact [m]; 0 before it."""
         if self.contact_position is None:
             return 0.0
         return float(matmul(self.tip_position - self.contact_position, direction))
 
     def reached(self) -> str:
-        """Where the tip is and what it feels, in words."""
+        """Position and force of the tip in words."""
         place = ", ".join(f"{value * 1e3:.2f}" for value in self.tip_position)
         force = float(norm(self.true_force))
         return f"tip at ({place}) mm, contact force {force:.3f} N, {self.step_time:.2f} s after the step began"
@@ -135,34 +135,34 @@ Predicate = Callable[[View], bool]
 
 
 class StepFailed(Exception):
-    """A step cannot reach its goal; the message says how far it came."""
+    """A step cannot reach its goal; the message states the point reached."""
 
 
 class Step(Protocol):
-    """One step of a script; any object like this is one."""
+    """Protocol of a script's steps."""
 
     @property
     def name(self) -> str:
-        """How the trace calls it; "" for the name of its class."""
+        """Name in the trace; "" for the name of its class."""
         ...
 
     @property
     def timeout(self) -> float:
-        """The longest that it may take [s]."""
+        """Largest duration [s]."""
         ...
 
     @property
     def speed(self) -> float:
-        """The fastest that it moves the tip [m/s]."""
+        """Largest speed of the tip [m/s]."""
         ...
 
     @property
     def ends_episode(self) -> bool:
-        """Whether the episode may end in it."""
+        """True if the episode may end in the step."""
         ...
 
     def actions(self, view: View) -> Plan:
-        """Yield actions, receive the view after each, return when done; StepFailed where that cannot be."""
+        """Yield actions, receive the view after each, return when done; raise StepFailed if that is impossible."""
         ...
 
 
@@ -171,9 +171,9 @@ Script = Sequence[Step]
 
 @dataclass(frozen=True)
 class _Checked:
-    """A step that does not move the tip and does not end the episode, unless a subclass says otherwise.
+    """Step with checked numbers; a resting tip and no end of the episode by default.
 
-    Its numbers are finite and above 0; its direction is brought to length 1.
+    Numbers have to be finite and above 0; a direction is normalised.
 
     Raises:
         ValueError: names the step, the field and the value.
@@ -183,22 +183,22 @@ class _Checked:
     speed = 0.0
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if one.type is float and not 0.0 < value < math.inf:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.type is float and not 0.0 < value < math.inf:
                 raise ValueError(
-                    f"{type(self).__name__}: {one.name} is {value!r}; it must be a finite number above 0, in SI units "
+                    f"{type(self).__name__}: {entry.name} is {value!r}; it must be finite and above 0, in SI units "
                     "(metres, newtons, seconds)"
                 )
-            if one.name == "direction" and value is not None:
+            if entry.name == "direction" and value is not None:
                 object.__setattr__(self, "direction", tuple((np.array(value) / norm(value)).tolist()))
 
 
 @dataclass(frozen=True)
 class MoveTo(_Checked):
-    """Move the tip straight to a point [m], until it is within `tolerance` [m] of it, at `speed` [m/s] or slower.
+    """Move the tip straight to within `tolerance` [m] of a point [m], at most at `speed` [m/s].
 
-    `turn` is how far the wrist turns on the way, evenly, in the instrument's own terms: an angle [rad] about its hinge,
+    `turn` is the even rotation of the wrist on the way, in the instrument's own terms: an angle [rad] about its hinge,
     or a rotation vector (3,) of an arm's tip.
     """
 
@@ -210,7 +210,7 @@ class MoveTo(_Checked):
     name: str = ""
 
     def actions(self, view: View) -> Plan:
-        """Towards the point, slower on the last millimetre."""
+        """Yield velocities towards the point, slower on the last millimetre."""
         left = np.atleast_1d(np.asarray(self.turn, dtype=np.float64))
         while norm(gap := np.array(self.point) - view.tip_position) > self.tolerance:
             velocity = _towards(gap, self.speed, view.control_step)
@@ -224,10 +224,10 @@ class MoveTo(_Checked):
 
 @dataclass(frozen=True)
 class Follow(_Checked):
-    """Move the tip along a recording's path at its pace: of the tip that `surgsim view` recorded, or time, x, y, z [m].
+    """Move the tip along a recorded path in its time: of a tip in `surgsim view`, or a file of time, x, y, z [s, m].
 
-    It goes to the path's beginning first. It fails where the tip is farther than `tolerance` [m] from where it was at
-    that time, such as on a path faster than `speed` [m/s]. In a pause the tip goes on as recorded; buttons do nothing.
+    It goes to the path's beginning first. It fails if the tip is farther than `tolerance` [m] from the path's point at
+    that time, as on a path faster than `speed` [m/s]. In a pause the tip goes on as recorded; buttons are ignored.
     """
 
     path: Path
@@ -238,27 +238,27 @@ class Follow(_Checked):
     name: str = ""
 
     def actions(self, view: View) -> Plan:
-        """To the first place, then each control step to where the tip was at its end.
+        """Yield actions to the first point, then in each control step to the path's point at its end.
 
         Raises:
-            ValueError: a file that is no recording and no trajectory; names the line.
+            ValueError: a file without a recording or trajectory; names the line.
         """
         time, places = _recorded_path(Path(self.path), "" if self.arm == 1 else f"_{self.arm}")
-        view = yield from _all_of(MoveTo(tuple(places[0].tolist()), self.speed), view)
-        begun = view.time
-        while (now := view.time - begun) < time[-1]:
-            there = np.array([np.interp(now, time, column) for column in places.T])
-            if (missed := float(norm(there - view.tip_position))) > self.tolerance:
-                raise StepFailed(f"was {missed * 1e3:.1f} mm from the path of {self.path.name} at {now:.2f} s of it")
+        view = yield from _played(MoveTo(tuple(places[0].tolist()), self.speed), view)
+        start = view.time
+        while (now := view.time - start) < time[-1]:
+            point = np.array([np.interp(now, time, column) for column in places.T])
+            if (error := float(norm(point - view.tip_position))) > self.tolerance:
+                raise StepFailed(f"was {error * 1e3:.1f} mm from the path of {self.path.name} at {now:.2f} s of it")
             ahead = np.array([np.interp(now + view.control_step, time, column) for column in places.T])
-            way = ahead - view.tip_position
-            distance = float(norm(way))
+            gap = ahead - view.tip_position
+            distance = float(norm(gap))
             pace = min(self.speed, distance / view.control_step)
-            view = yield view.action(way * (pace / distance) if distance > 0.0 else np.zeros(3))
+            view = yield view.action(gap * (pace / distance) if distance > 0.0 else np.zeros(3))
 
 
 def _recorded_path(path: Path, mark: str) -> tuple[FloatArray, FloatArray]:
-    """Times from 0 [s] (n,) and places [m] (n, 3) of a tip that was recorded, else of a hand without pauses."""
+    """Times from 0 [s] (n,) and positions [m] (n, 3) of a recorded tip, else of a hand without pauses."""
     with path.open(encoding="utf-8", errors="replace") as file:
         of_tip = f"{TIP_PREFIX}x{mark}" in file.readline().strip().split(",")
     motion = read_motion(path, mark, of_tip=of_tip)
@@ -267,24 +267,24 @@ def _recorded_path(path: Path, mark: str) -> tuple[FloatArray, FloatArray]:
     return time - time[0], places
 
 
-def _all_of(step: "Step", view: View) -> Generator[Action, View, View]:
-    """The actions of a step within another one; returns the last view."""
-    plan = step.actions(view)
+def _played(step: Step, view: View, arm: str = "") -> Generator[Action, View, View]:
+    """Actions of a step within another one, for an arm of several; returns the last view."""
+    plan = step.actions(view.arms[arm] if arm else view)
     try:
         action = next(plan)
         while True:
             view = yield action
-            action = plan.send(view)
+            action = plan.send(view.arms[arm] if arm else view)
     except StopIteration:
         return view
 
 
 @dataclass(frozen=True)
 class PressUntil(_Checked):
-    """Press until the tissue pushes back with `force` [N], less `tolerance`, at most `max_depth` [m] past contact.
+    """Press until the tissue's force is `force` [N], less `tolerance`, at most `max_depth` [m] past contact.
 
-    It slows down as the force comes near, by the stiffness that it feels. Depth counts from where the tip first touched
-    in this step; a press that used it up without the force fails. The force is the true one, or what the sensor reads.
+    It slows down near the force, by the estimated stiffness. Depth counts from the first contact in this step; a press
+    at its largest depth without the force fails. The force is the true or the sensed one.
     """
 
     force: float
@@ -297,26 +297,26 @@ class PressUntil(_Checked):
     name: str = ""
 
     def actions(self, view: View) -> Plan:
-        """Into the tissue, in steps that are not meant to exceed the force."""
+        """Yield velocities into the tissue, chosen not to exceed the force."""
         along = view.approach if self.direction is None else np.array(self.direction)
         stiffness = 0.0
-        while (felt := view.pressing_force(along, sensed=self.sensed)) < self.force - self.tolerance:
+        while (force := view.pressing_force(along, sensed=self.sensed)) < self.force - self.tolerance:
             left = self.max_depth - view.depth(along)
             if left <= DEPTH_SLACK:
-                raise StepFailed(f"pressed {self.max_depth * 1e3:.2f} mm past contact and felt {felt:.3f} N")
+                raise StepFailed(f"pressed {self.max_depth * 1e3:.2f} mm past contact and felt {force:.3f} N")
             speed = min(self.speed, left / view.control_step)
             if stiffness > 0.0:
-                speed = min(speed, (self.force - felt) / (stiffness * view.control_step))
-            before, place = felt, view.tip_position
+                speed = min(speed, (self.force - force) / (stiffness * view.control_step))
+            place = view.tip_position
             view = yield view.action(along * speed)
             travel = float(matmul(view.tip_position - place, along))
             if travel > TRAVEL_READ:
-                stiffness = max(stiffness, (view.pressing_force(along, sensed=self.sensed) - before) / travel)
+                stiffness = max(stiffness, (view.pressing_force(along, sensed=self.sensed) - force) / travel)
 
 
 @dataclass(frozen=True)
 class Hold(_Checked):
-    """Keep the tip still for `duration` [s]; it ends with the first control step that is not shorter."""
+    """Keep the tip still for `duration` [s], rounded up to control steps."""
 
     duration: float
     name: str = ""
@@ -339,11 +339,11 @@ class Lift(_Checked):
     name: str = ""
 
     def actions(self, view: View) -> Plan:
-        """Away from the tissue."""
+        """Yield velocities away from the tissue."""
         along = -view.approach if self.direction is None else np.array(self.direction)
         goal = view.tip_position + along * self.height
         while (left := float(matmul(goal - view.tip_position, along))) > 0.0:
-            # A little further than the goal: the tip lags behind its command, and the step has to end.
+            # A little beyond the goal: the tip lags behind its command, and the step has to end.
             view = yield view.action(along * min(self.speed, (left + 0.0002) / view.control_step))
 
 
@@ -363,41 +363,41 @@ class WaitUntil(_Checked):
 
 @dataclass(frozen=True)
 class Declare(_Checked):
-    """Say "the lesion is here", the tip still, until the episode ends; it counts only while the tip touches tissue."""
+    """Declare the lesion at the resting tip until the episode ends; it counts only in contact with tissue."""
 
     timeout: float = 0.5
     name: str = ""
     ends_episode = True
 
     def actions(self, view: View) -> Plan:
-        """Declare in every control step: the episode's end ends it."""
+        """Declare in each control step until the end of the episode."""
         while True:
             view = yield view.still(declare=True)
 
 
 @dataclass(frozen=True)
 class AwaitEnd(_Checked):
-    """Keep the tip still until the episode ends by itself, such as by success; fails after `timeout` [s]."""
+    """Keep the tip still until the episode ends, such as by success; fails after `timeout` [s]."""
 
     timeout: float
     name: str = ""
     ends_episode = True
 
     def actions(self, view: View) -> Plan:
-        """No motion: the episode's end ends it."""
+        """No motion until the end of the episode."""
         while True:
             view = yield view.still()
 
 
 @dataclass(frozen=True)
 class Control(_Checked):
-    """Let a controller of your own act, until `until(view)` is true or the episode ends; fails after `timeout` [s].
+    """Act by a controller of your own until `until(view)` is true or the episode ends; fails after `timeout` [s].
 
-    The controller is called with each observation and returns the action; if it has a `reset`, that is called first.
-    Without `until` it acts for `timeout`, which is then no failure.
+    The controller is called with each observation and returns the action, or a dictionary of commands in SI units by
+    name; its `reset`, if any, is called first. Without `until` it acts for `timeout`, without failure.
     """
 
-    controller: Callable[[np.ndarray], Action] = field(repr=False)
+    controller: Callable[[np.ndarray], Action | dict[str, Any]] = field(repr=False)
     timeout: float
     until: Predicate | None = field(default=None, repr=False)
     name: str = ""
@@ -409,23 +409,24 @@ class Control(_Checked):
         if reset is not None:
             reset()
         while not (_over(view, self.timeout) if self.until is None else self.until(view)):
-            view = yield np.asarray(self.controller(copy.deepcopy(view.observation)))
+            acted = self.controller(copy.deepcopy(view.observation))
+            view = yield view.layout.action(**acted) if isinstance(acted, dict) else np.asarray(acted)
 
 
 def _over(view: View, duration: float) -> bool:
-    """Whether a time since the step began is over, to rounding."""
+    """True after a duration [s] of the step, to rounding."""
     return view.step_time >= duration - 1e-9
 
 
 def _towards(gap: FloatArray, speed: float, control_step: float) -> FloatArray:
-    """Velocity along a gap [m] that does not overshoot it [m/s], shape (3,)."""
+    """Velocity along a gap [m] without overshoot [m/s], shape (3,)."""
     distance = float(norm(gap))
     return gap / distance * min(speed, APPROACH_GAIN * distance / control_step)
 
 
 @dataclass(frozen=True)
 class CloseJaw(_Checked):
-    """Close the jaw, the tip still, until it grips tissue with `force` [N]; its target stays closed afterwards."""
+    """Close the jaw, the tip still, until it grips tissue with `force` [N]; its command stays closed."""
 
     force: float
     timeout: float = 3.0
@@ -439,7 +440,7 @@ class CloseJaw(_Checked):
 
 @dataclass(frozen=True)
 class OpenJaw(_Checked):
-    """Open the jaw, the tip still, until its pads are `gap` [m] apart and hold nothing."""
+    """Open the jaw, the tip still, until its pads are `gap` [m] apart and without tissue."""
 
     gap: float
     timeout: float = 3.0
@@ -467,11 +468,11 @@ class PressSupport(_Checked):
     ends_episode = True
 
     def actions(self, view: View) -> Plan:
-        """Towards the support, or away from it where the force is too large."""
+        """Yield velocities towards the support, or away from it if the force is too large."""
         along = np.array(self.direction)
         while True:
-            missing = self.force - view.support_force
-            speed = float(np.clip(GAIN * missing, -self.speed, self.speed))
+            error = self.force - view.support_force
+            speed = float(np.clip(GAIN * error, -self.speed, self.speed))
             aside = np.array(self.point) - view.tip_position
             aside -= matmul(aside, along) * along
             view = yield view.action(speed * along + HOMING * aside)
@@ -479,71 +480,64 @@ class PressSupport(_Checked):
 
 @dataclass(frozen=True)
 class _Wrapped:
-    """Another step; its name, its timeout and its speed are that step's."""
+    """Wrapper of a step, with its name, timeout and speed."""
 
     step: Step
 
     @property
     def name(self) -> str:
-        """The step's own, or its class's."""
+        """Name of the step or its class."""
         return self.step.name or type(self.step).__name__
 
     @property
     def timeout(self) -> float:
-        """The step's own [s]."""
+        """Timeout of the step [s]."""
         return self.step.timeout
 
     @property
     def speed(self) -> float:
-        """The step's own [m/s]."""
+        """Speed of the step [m/s]."""
         return self.step.speed
 
     @property
     def ends_episode(self) -> bool:
-        """As the step says."""
+        """Property of the step."""
         return self.step.ends_episode
 
     def actions(self, view: View) -> Plan:
-        """The step's actions."""
+        """Actions of the step."""
         yield from self.step.actions(view)
 
 
 @dataclass(frozen=True)
 class MayEnd(_Wrapped):
-    """Another step, in which the episode may end in success; the rest of the script is then skipped."""
+    """Wrapper for a step with a possible end of the episode in success; the remaining script is then skipped."""
 
     @property
     def ends_episode(self) -> bool:
-        """True: the episode may end in this step."""
+        """True."""
         return True
 
 
 @dataclass(frozen=True)
 class OfArm(_Wrapped):
-    """Another step, made by one of several arms; the others stay where they are."""
+    """Wrapper for a step of one of several arms; the others stand still."""
 
     arm: str
 
     def actions(self, view: View) -> Plan:
-        """The step's actions, from that arm's view."""
-        plan = self.step.actions(view.arms[self.arm])
-        try:
-            action = next(plan)
-            while True:
-                view = yield action
-                action = plan.send(view.arms[self.arm])
-        except StopIteration:
-            return
+        """Actions of the step from the arm's view."""
+        yield from _played(self.step, view, self.arm)
 
 
 @dataclass(frozen=True)
 class Until(_Wrapped):
-    """Another step, which is over as soon as `predicate(view)` is true, or by itself."""
+    """Wrapper for a step that ends as soon as `predicate(view)` is true, or by itself."""
 
     predicate: Predicate = field(repr=False)
 
     def actions(self, view: View) -> Plan:
-        """The step's actions until the predicate is true."""
+        """Actions of the step until the predicate is true."""
         if self.predicate(view):
             return
         plan = self.step.actions(view)
@@ -557,12 +551,12 @@ class Until(_Wrapped):
 
 @dataclass(frozen=True)
 class Tracked(_Wrapped):
-    """Another step on a surface that moves: its points are those of the surface at rest, and all tips go with it."""
+    """Wrapper for a step on a moving surface: its points are on the surface at rest, and all tips move with it."""
 
     tracker: SurfaceTracker = field(repr=False)
 
     def actions(self, view: View) -> Plan:
-        """The step's actions as seen from the surface, and the surface's velocity in the next control step."""
+        """Actions of the step relative to the surface, plus the surface's velocity in the next control step."""
         shift, contact_shift = self.tracker.displacement(), None
         plan = self.step.actions(view.from_surface(shift, shift))
         try:

@@ -1,4 +1,4 @@
-"""The record of a run: forces and poses at haptic rate, observations at control rate, steps; its tables and plot."""
+"""Record of a run: forces and poses at haptic rate, observations at control rate, steps; tables and plot."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepInterval:
-    """When a step of the script ran [s], since the episode's reset: after `start`, up to and with `end`."""
+    """Time of a step of the script since the episode's reset [s]: after `start`, up to and with `end`."""
 
     name: str
     start: float
@@ -31,23 +31,23 @@ class StepInterval:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A run of a script.
+    """Record of a script's run.
 
     Fields:
-        start: when it began [s] since the episode's reset, as all times here
+        start: its beginning since the episode's reset [s], as all times here
         haptic_time: end of each haptic step [s]                                                          (n,)
         wrench: tissue's mean force [N], torque about the centre of mass [N m] on each tool               (n, n_tool, 6)
         tip_position: centre of the tip ball [m]                                                          (n, 3)
         tip_orientation: unit quaternion (w, x, y, z), the tip's axes in the world                        (n, 4)
-        depth: how far the tip is past where the present contact began, along the approach [m]; 0 without contact  (n,)
+        depth: of the tip past the beginning of the current contact, along the approach [m]; 0 without contact  (n,)
         control_time: end of each control step [s]                                                        (m,)
         observation, action, reward: after, in and for each control step                    (m, n_obs), (m, n_act), (m,)
-            observations that are dictionaries give a dictionary of arrays (m, ...)
+            dictionary observations give a dictionary of arrays (m, ...)
         infos: of each control step
-        steps: when each step of the script ran
-        tool_names: of the bodies that tissue feels
-        terminated, truncated: whether the episode ended with the run
-        failure: "" or which step failed, why, and what the run had reached
+        steps: intervals of the script's steps
+        tool_names: of the bodies in contact with tissue
+        terminated, truncated: True if the episode ended with the run
+        failure: "", or the failed step, the reason and the state of the run
     """
 
     start: float
@@ -89,14 +89,14 @@ class Trace:
 
     @property
     def info(self) -> dict[str, Any]:
-        """The info of the last control step; empty where there was none."""
+        """Info of the last control step; empty if there was none."""
         return self.infos[-1] if self.infos else {}
 
     def between(self, first: str, last: str | None = None) -> Trace:
-        """The part of the run from step `first` to the end of step `last` (or of the same), by their names.
+        """Part of the run from step `first` to the end of step `last` (or of the same), by their names.
 
         Raises:
-            ValueError: no step has that name (says which there are).
+            ValueError: no step has that name (lists the names).
         """
         begin, end = self._index(first), self._index(first if last is None else last)
         start, stop = self.steps[begin].start, self.steps[end].end
@@ -112,9 +112,9 @@ class Trace:
         )
 
     def to_csv(self, path: str | Path) -> tuple[Path, Path]:
-        """Write haptic rate to `path` and control rate beside it (`run.csv`, `run_control.csv`); both paths.
+        """Write haptic rate to `path`, control rate beside it (`run.csv`, `run_control.csv`); return both paths.
 
-        Columns name their units; numbers are written in full, so that reading them gives the same bits.
+        Columns name their units; numbers are written exactly.
         """
         path = Path(path)
         beside = path.with_name(f"{path.stem}_control.csv")
@@ -123,7 +123,7 @@ class Trace:
         return path, beside
 
     def plot(self, path: str | Path) -> None:
-        """Draw force and depth over time, the steps marked, into a picture file."""
+        """Plot force and depth over time, with the steps marked, in a picture file."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(10.0, 5.6), dpi=110, facecolor="white", layout="constrained")
@@ -131,7 +131,7 @@ class Trace:
         figure.savefig(path)
 
     def step_names(self, times: FloatArray) -> list[str]:
-        """The step of the script that each time [s] belongs to."""
+        """Name of the script's step at each time [s]."""
         ends = np.array([step.end for step in self.steps])
         return [self.steps[index].name for index in np.searchsorted(ends, times - 1e-9)]
 
@@ -143,7 +143,7 @@ class Trace:
 
 
 def contact_depth(wrench: FloatArray, tip_position: FloatArray, approach: FloatArray) -> FloatArray:
-    """How far the tip is past where the present contact began, along the approach [m]; 0 without contact, (n,).
+    """Depth of the tip past the beginning of the current contact, along the approach [m]; 0 without contact, (n,).
 
     Args:
         wrench: on each tool at each haptic step [N, N m], shape (n, n_tool, 6).
@@ -152,13 +152,13 @@ def contact_depth(wrench: FloatArray, tip_position: FloatArray, approach: FloatA
     """
     touching = np.asarray(wrench.any(axis=(1, 2)))
     along = matmul(tip_position, approach)
-    began = touching & ~np.concatenate([[False], touching[:-1]])
-    origin = np.maximum.accumulate(np.where(began, np.arange(len(along)), 0))
+    starts = touching & ~np.concatenate([[False], touching[:-1]])
+    origin = np.maximum.accumulate(np.where(starts, np.arange(len(along)), 0))
     return np.where(touching, along - along[origin], 0.0)
 
 
 def _within(times: FloatArray, start: float, stop: float) -> slice:
-    """Which of the rising times [s] lie after start and not after stop, to rounding."""
+    """Slice of the increasing times [s] after `start` and not after `stop`, to rounding."""
     return slice(int(np.searchsorted(times, start + 1e-9)), int(np.searchsorted(times, stop + 1e-9)))
 
 
@@ -169,7 +169,7 @@ WRENCH_COLUMNS = ("force_x_N", "force_y_N", "force_z_N", "torque_x_Nm", "torque_
 
 
 def _haptic_rows(trace: Trace) -> Iterator[list]:
-    """The columns' names, then a row for each haptic step."""
+    """Names of the columns, then a row for each haptic step."""
     wrenches = [f"{tool}_{column}" for tool in trace.tool_names for column in WRENCH_COLUMNS]
     yield ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches]
     names, sizes = trace.step_names(trace.haptic_time), trace.force_size.tolist()
@@ -179,7 +179,7 @@ def _haptic_rows(trace: Trace) -> Iterator[list]:
 
 
 def _control_rows(trace: Trace) -> Iterator[list]:
-    """The columns' names, then a row for each control step; observations that are pictures are left out."""
+    """Names of the columns, then a row for each control step; pictures are left out."""
     observed = trace.observation if isinstance(trace.observation, dict) else {"": trace.observation}
     parts = {"observation" + f"_{name}" * bool(name): part for name, part in observed.items() if part.ndim == 2}
     parts["action"] = trace.action
@@ -199,12 +199,12 @@ def _write(path: Path, rows: Iterator[list]) -> None:
 # ---- picture -------------------------------------------------------------------------------------------------------
 
 FORCE, DEPTH, INK, BAND = "#b5322a", "#2b5f8a", "#20242c", "#eef1f5"
-# A step's name is upright where the step takes less than this share of the run's time.
+# Share of the run's time below which a step's name is turned.
 NARROW = 0.12
 
 
 def _draw(trace: Trace, force: Axes, below: Axes) -> None:
-    """Draw forces [N] above, depth [mm] or the visible share [%] of a retraction's target below; steps as bands."""
+    """Plot forces [N] above, depth [mm] or the visible share [%] of a retraction's target below; steps as bands."""
     if "visible" in trace.info:
         ends = trace.control_time
         _draw_retraction(trace, force, below)
@@ -225,7 +225,7 @@ def _draw(trace: Trace, force: Axes, below: Axes) -> None:
 
 
 def _draw_retraction(trace: Trace, force: Axes, seen: Axes) -> None:
-    """Draw the jaw's grip and pull [N], and the visible share of the target [%]."""
+    """Plot the jaw's grip and pull [N], and the visible share of the target [%]."""
     grip, pull, share = (
         np.array([info[name] for info in trace.infos]) for name in ("grip_force", "pull_force", "visible")
     )

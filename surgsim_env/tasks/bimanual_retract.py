@@ -10,19 +10,10 @@ from msdm_core.arithmetic import norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
+from surgsim_env.tasks.channels import LENGTH_SCALE, SPEED_BOUND, TIP_POSITION, force_scale, soft_force_share
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, Channel, Command, ControlStep, Reward
 from surgsim_env.tasks.retract import AXIS_BOUND, FORCE_BOUND, SUCCESS_SHARE, TURNING_FULL_SCALE, RetractTask
-from surgsim_env.tasks.task import (
-    LENGTH_SCALE,
-    SPEED_BOUND,
-    SPEED_FULL_SCALE,
-    TIP_POSITION,
-    InfoValue,
-    Start,
-    force_scale,
-    soft_force_share,
-)
+from surgsim_env.tasks.task import InfoValue, Scenario
 
 if TYPE_CHECKING:
     from surgsim_env.instruments.arm.pair import Pair
@@ -91,10 +82,13 @@ class BimanualRetractTask(RetractTask):
     commands: ClassVar[tuple[Command, ...]] = (
         Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "left tip's velocity along x, y, z"),
         Command("turning", 3, TURNING_FULL_SCALE, "rad/s", "rotation of the left tip"),
-        Command("jaw", 1, meaning="target of the left jaw, which moves at its limited speed: -1 closed, 1 open"),
+        Command(
+            "jaw", 1, meaning="target of the left jaw, which moves at its limited speed: -1 closed, 1 open",
+            default=lambda task: task.jaw_target,
+        ),
         Command("right", 3, SPEED_FULL_SCALE, "m/s", "right tip's velocity"),
         Command("right_turning", 3, TURNING_FULL_SCALE, "rad/s", "rotation of the right tip"),
-    )
+    )  # fmt: skip
     channels: ClassVar[tuple[Channel, ...]] = (
         *RetractTask.channels,
         replace(
@@ -113,7 +107,7 @@ class BimanualRetractTask(RetractTask):
             meaning="the right tip's x and z axes in the world",
         ),
         Channel(
-            "right_force", 3, "N", sensor=1.0,
+            "right_force", 3, "N", sensor=1.0, late_bias=True,
             read=lambda task, simulation: _pair(simulation).contact_force("right", simulation.contact_wrench),
             meaning="the tissue's force on the right arm, through the sensor model",
             scale=force_scale, scale_text="soft limit",
@@ -160,12 +154,11 @@ class BimanualRetractTask(RetractTask):
         Reward("fault", -15.0, "failure", "the simulation could not go on"),
         Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
     )  # fmt: skip
-    default_instrument = "psm_pair"
-    lanes = False
+    setup = replace(RetractTask.setup, instrument="psm_pair")
     kept = (*RetractTask.kept, "uncovered_share", "touch_force")
     takes_pair = True
 
-    def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         """Retract the lobe of an anatomy with two arms.
 
         Raises:
@@ -174,37 +167,35 @@ class BimanualRetractTask(RetractTask):
         """
         from surgsim_env.instruments.arm.pair import Pair
 
-        if not isinstance(instrument, Pair):
+        scene = scenario.anatomy.scene
+        if not isinstance(scenario.instrument, Pair):
             raise ValueError(
-                f"scene {anatomy.scene.name!r}: instrument {anatomy.scene.instrument.model!r} is one arm, and two are "
+                f"scene {scene.name!r}: instrument {scene.instrument.model!r} is one arm, and two are "
                 'needed: take instrument="psm_pair", or two arms such as "psm_retractor+six_axis"'
             )
-        _check_tips(instrument)
-        super().__init__(anatomy, instrument)
-        if self.table.right_start_lower is None or self.table.right_start_upper is None or not anatomy.scene.supports:
+        _check_tips(scenario.instrument)
+        super().__init__(scenario)
+        if self.table.right_start_lower is None or self.table.right_start_upper is None or not scene.supports:
             raise ValueError(
-                f"scene {anatomy.scene.name!r}: two hands need retract.right_start_lower, right_start_upper and "
+                f"scene {scene.name!r}: two hands need retract.right_start_lower, right_start_upper and "
                 "[[supports]] that bear the target: add them, or take a scene that has them, such as 'lobe'"
             )
         self.touch_force = self.uncovered_share = 0.0
 
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
+    def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
         """Set both tips' velocities and rotations, and the left jaw's target."""
-        velocity, turning = (
-            np.stack([self.commanded(action, left), self.commanded(action, right)])
-            for left, right in (("velocity", "right"), ("turning", "right_turning"))
-        )
+        velocity = np.stack([commands["velocity"], commands["right"]])
+        turning = np.stack([commands["turning"], commands["right_turning"]])
         instrument.command_velocity(velocity, turning)
-        self.command_jaw(float(action[self.jaw_place]), instrument)
+        self.command_jaw(float(commands["jaw"][0]), instrument)
 
-    def reset(self, rng: np.random.Generator) -> Start:
-        """Draw an episode of retraction, and the right arm's start and bias."""
-        start = super().reset(rng)
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw the right arm's start."""
+        left = super().draw(rng)
         assert self.table.right_start_lower is not None and self.table.right_start_upper is not None
         right = rng.uniform(self.table.right_start_lower, self.table.right_start_upper)
-        self.sensors["right_force"].reset(rng)
         self.touch_force = self.uncovered_share = 0.0
-        return Start(start.organ, np.stack([start.tip_position, right]))
+        return np.stack([left, right])
 
     def look(self, simulation: Simulation) -> None:
         """As `RetractTask.look`; also what the organ leaves uncovered and what the right tip presses."""
@@ -221,7 +212,7 @@ class BimanualRetractTask(RetractTask):
         harm = super().harm(step)
         if harm:
             return harm
-        if self.touch_force > self.force_limit:
+        if self.touch_force > self.limits.hard_force:
             return "hard_force"
         return "collided" if _pair(step.simulation).collision_force > COLLISION_FORCE else ""
 

@@ -1,4 +1,4 @@
-"""What a task declares once: its commands, observation channels and reward terms, and the tables that document them."""
+"""The declaration of a task: commands, observation channels, reward terms, setup, and the tables that document them."""
 
 import inspect
 import math
@@ -9,7 +9,14 @@ from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.scene.levels import DrawnOrgan
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Scene
+
+# Full scale of a velocity command [m/s].
+SPEED_FULL_SCALE = 0.02
 
 Size = int | Callable[[Any], int]
 Bound = float | Sequence[float] | Callable[[Any, Any], ArrayLike]
@@ -34,12 +41,14 @@ class Command:
     """A named part of the action.
 
     Fields:
-        name: an identifier; `Task.action` takes it as a keyword
+        name: an identifier; `TaskLayout.action` takes it as a keyword
         size: number of entries, or a function `(task)`; 0 leaves the command out
         scale: SI value of an entry of 1; entries lie in [-1, 1]
         unit: SI unit, "" for none
         meaning: what it does, for the table of actions
         size_text: what the table shows for a size that is a function
+        axes: function `(task)` that returns the axes of a vector, unit vectors as rows (3, 3); None for the world's
+        default: function `(task)` that returns the SI value where `TaskLayout.action` is given none; None for 0
     """
 
     name: str
@@ -48,6 +57,8 @@ class Command:
     unit: str = ""
     meaning: str = ""
     size_text: str = "by the scene"
+    axes: Callable[[Any], FloatArray | None] | None = None
+    default: Callable[[Any], ArrayLike] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +79,7 @@ class Channel:
         size_text, bounds_text, scale_text: what the table shows for a size, bounds and a scale that are functions
         scale: value that an environment observes as 1, as a bound is given; required of a channel with a unit
         origin: value that it observes as 0, likewise
+        late_bias: whether the sensor's bias is drawn after the task's `draw`, not before
     """
 
     name: str
@@ -84,6 +96,7 @@ class Channel:
     scale: Bound | None = None
     origin: Bound = 0.0
     scale_text: str = "by the scene"
+    late_bias: bool = False
 
     def __post_init__(self) -> None:
         if self.scale is None:
@@ -161,6 +174,33 @@ class Reward:
             raise ValueError(f"reward {self.name!r} pays a change, but has no value that could: give `value`")
 
 
+@dataclass(frozen=True)
+class Setup:
+    """Scene, instrument, lesions and length of a task's episodes.
+
+    Fields:
+        scene, instrument, level: where the environment's arguments say none; instrument None: the scene's; level None:
+            the scene's own ranges
+        lesion_count: number of lesions, or its least and most; None: as drawn by the level, without a level none
+        episode_steps: control steps until an episode is truncated; None where the task ends it by itself
+        load: function that makes the scene of a name or file
+        drawn: class of an episode's organ, with `draw`, `to_json`, `from_json` and `compiled` as `DrawnOrgan` has
+    """
+
+    scene: str = "phantom"
+    instrument: str | None = None
+    level: str | None = None
+    lesion_count: int | tuple[int, int] | None = None
+    episode_steps: int | None = 600
+    load: Callable[[str], Scene] = make_scene
+    drawn: type[Any] = DrawnOrgan
+
+
+def reward_weights(task_class: Any) -> dict[str, float]:
+    """Weights of a task's reward terms, by name."""
+    return {reward.name: reward.weight for reward in task_class.rewards}
+
+
 # ---- tables -------------------------------------------------------------------------------------------------------
 
 
@@ -210,7 +250,7 @@ def documentation(task_class: Any) -> str:
         "Arguments": COMMON_ARGUMENTS,
     }
     box = {"Action Space": "`Box(-1, 1, float32)`", "Observation Space": "`Box(float32)`, all bounds finite"}
-    first = f"* `scene`: the name or file of a scene; default {task_class.default_scene!r}.\n* `instrument`: likewise."
+    first = f"* `scene`: the name or file of a scene; default {task_class.setup.scene!r}.\n* `instrument`: likewise."
     for heading, text in filled.items():
         told = sections.get(heading) or {**box, "Arguments": first}.get(heading, "")
         sections[heading] = f"{told}\n{text}".strip() if heading == "Arguments" else f"{told}\n\n{text}".strip()

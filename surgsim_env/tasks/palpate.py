@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -15,21 +14,18 @@ from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.face_frame import FaceFrame
 from surgsim_env.palpation.touches import Indenter, TouchMemory, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.levels import DrawnOrgan
 from surgsim_env.scene.load import nearest
-from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
-from surgsim_env.tasks.palpate_sites import CELL_BOUND, WIDE
-from surgsim_env.tasks.task import (
+from surgsim_env.tasks.channels import (
     CONTACT_FORCE,
-    SPEED_FULL_SCALE,
     TIME_LEFT,
     TIP_POSITION,
     TIP_VELOCITY,
-    InfoValue,
-    Task,
     force_scale,
     soft_force_share,
 )
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, Channel, Command, ControlStep, Reward, Setup
+from surgsim_env.tasks.palpate_sites import CELL_BOUND, WIDE
+from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
 # Control steps of an episode; EPISODE_STEPS_WIDE where the chart's longer side exceeds WIDE tip radii.
 EPISODE_STEPS, EPISODE_STEPS_WIDE = 600, 1200
@@ -152,7 +148,14 @@ class PalpateTask(Task):
     """
 
     commands = (
-        Command("velocity", 3, SPEED_FULL_SCALE, "m/s", "tip velocity along x, y, z, or along the axes of `frame`"),
+        Command(
+            "velocity",
+            3,
+            SPEED_FULL_SCALE,
+            "m/s",
+            "tip velocity along x, y, z, or along the axes of `frame`",
+            axes=lambda task: None if task.frame is None else task.frame.axes,
+        ),
         Command("declare", 1, meaning='above 0.8 for 3 successive control steps, in contact: "the lesion is here"'),
     )
     channels = (
@@ -244,15 +247,13 @@ class PalpateTask(Task):
             lambda task, step: _step_weight(task, step) * (task.episode_steps - task.step_count),
         ),
     )  # fmt: skip
-    # Of each environment, by the size of its face.
-    episode_steps = None
+    # The number of control steps follows from the size of the face.
+    setup = Setup(lesion_count=1, episode_steps=None)
     kept = ("declare_count", "_declare_value", "readings")
-    drawn: DrawnOrgan | None
 
     def __init__(
         self,
-        anatomy: Anatomy,
-        instrument: Instrument | None = None,
+        scenario: Scenario,
         *,
         memory: bool = False,
         frame: str = "world",
@@ -261,19 +262,19 @@ class PalpateTask(Task):
         """Palpate an anatomy.
 
         Args:
-            anatomy: of a scene that says how a lesion is drawn.
-            instrument: that acts on it.
+            scenario: of a scene with the ranges of a lesion.
             memory: the observation holds what was felt so far.
             frame: "world", or "face": commands are along the axes of the face, in which the tip is observed too.
             episode_steps: control steps of an episode; by default 600, or 1200 on a face longer than ten tip radii.
 
         Raises:
-            ValueError: the scene does not say how a lesion is drawn, an unknown frame (names the known), or
+            ValueError: a scene without a [lesion] table, an unknown frame (names the known), or
                 `episode_steps` that is no whole number above 0.
         """
-        if anatomy.scene.lesion is None:
+        scene = scenario.anatomy.scene
+        if scene.lesion is None:
             raise ValueError(
-                f"scene {anatomy.scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
+                f"scene {scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
         if frame not in FRAMES:
@@ -281,12 +282,12 @@ class PalpateTask(Task):
             raise ValueError(f"frame {frame!r} is unknown{nearest(frame, list(FRAMES))}; the frames are {known}")
         if episode_steps is not None and episode_steps < 1:
             raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
-        super().__init__(anatomy, instrument)
-        self.charted = charted_face(anatomy)
+        super().__init__(scenario)
+        self.charted = charted_face(self.anatomy)
         wide = self.charted.chart.extent.max() > WIDE * self.charted.tip_radius
         # The members of a family have the number of their template.
-        self.episode_steps = episode_steps or (EPISODE_STEPS_WIDE if wide else EPISODE_STEPS)  # type: ignore[misc]
-        self.memory = touch_memory(anatomy) if memory else None
+        self.episode_steps = episode_steps or (EPISODE_STEPS_WIDE if wide else EPISODE_STEPS)
+        self.memory = touch_memory(self.anatomy) if memory else None
         self.frame = FaceFrame.of(self.charted) if frame == "face" else None
         # Depth of the ball below the surface at rest [m], and the outward normal there.
         self.tip_depth, self.surface_normal = 0.0, np.zeros(3)
@@ -294,14 +295,15 @@ class PalpateTask(Task):
         self._declare_value = 0.0
         self._error: float | None = None
 
-    def take_anatomy(self, anatomy: Anatomy) -> None:
-        """As `Task.take_anatomy`, with an empty memory on the chart of its face, and its frame."""
-        super().take_anatomy(anatomy)
-        self.charted = charted_face(anatomy)
+    def _chart(self) -> None:
+        """Take the chart of the episode's member, an empty memory on it, and its frame."""
+        if self.charted is (charted := charted_face(self.anatomy)):
+            return
+        self.charted = charted
         if self.memory is not None:
-            self.memory = touch_memory(anatomy)
+            self.memory = touch_memory(self.anatomy)
         if self.frame is not None:
-            self.frame = FaceFrame.of(self.charted)
+            self.frame = FaceFrame.of(charted)
 
     @property
     def success_distance(self) -> float:
@@ -314,14 +316,9 @@ class PalpateTask(Task):
         """The lesion of the episode; None before the first."""
         return self.lesions[0] if self.lesions else None
 
-    def draw_organ(self, rng: np.random.Generator) -> DrawnOrgan:
-        """Draw one lesion, and what else the level draws."""
-        if self.level is None:
-            return DrawnOrgan((self.anatomy.random_lesion(rng),))
-        return self.level.draw(self.anatomy, rng, lesion_count=1)
-
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """Draw the tip's place above the palpable face, and forget the last episode."""
+        self._chart()
         self.declare_count = 0
         self._declare_value = 0.0
         if self.memory is not None:
@@ -330,33 +327,22 @@ class PalpateTask(Task):
         gap = self.anatomy.scene.instrument.tip_radius + rng.uniform(*START_GAP)
         return above + outward * gap
 
-    def action(self, velocity: FloatArray | None = None, **commands: Any) -> FloatArray:
-        """As `Task.action`, for a velocity of the world [m/s] in any frame."""
-        if velocity is not None and self.frame is not None:
-            velocity = self.frame.vector(velocity)
-        return super().action(velocity, **commands)
-
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
-        """Give the instrument the velocity of an action (action_size,), which is along the axes of the frame."""
-        velocity = self.commanded(action, "velocity")
-        instrument.command_velocity(velocity if self.frame is None else self.frame.in_world(velocity))
-
-    def begin(self, action: FloatArray) -> None:
-        """Begin a control step: count it and keep what the action declares."""
-        super().begin(action)
-        self._declare_value = float(self.commanded(action, "declare")[0])
+    def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
+        """Command the tip's velocity, and keep the declared value."""
+        super().command(commands, instrument)
+        self._declare_value = float(commands["declare"][0])
 
     def resting_place(self, simulation: Simulation) -> FloatArray:
         """The tip's position [m] (3,) beside the organ at rest: less the way that its ground has moved there."""
         tip = simulation.instrument.tip_position
         return tip - simulation.ground_shift(tip)
 
-    def look(self, simulation: Simulation) -> None:
+    def update(self, step: ControlStep) -> None:
         """Find the ball's depth below the surface at rest on its ground, and add the force reading to the memory."""
         memory, frame = self.memory, self.frame
         if memory is None and frame is None:
             return
-        tip = self.resting_place(simulation)
+        tip = self.resting_place(step.simulation)
         surface, normal = self.anatomy.face.project(tip)
         depth = self.charted.tip_radius - float(matmul(tip - surface, normal))
         self.tip_depth, self.surface_normal = depth, normal
@@ -401,4 +387,5 @@ class PalpateTask(Task):
 
     @readings.setter
     def readings(self, sums: FloatArray | None) -> None:
+        self._chart()
         self.memory = None if self.memory is None or sums is None else self.memory.restored(*sums)

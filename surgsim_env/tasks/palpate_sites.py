@@ -1,31 +1,25 @@
 """Palpation press by press: choose sites to press on; an estimator locates the lesions from what was felt."""
 
-import json
 import math
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from msdm_core.arithmetic import exp, matmul
-from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading
-from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.palpation.chart import MAP_SIDE, HealthyMap, Site, charted_face, healthy_map_of
+from surgsim_env.palpation.chart import MAP_SIDE, Site, charted_face, healthy_map_of
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimate, LesionEstimator
 from surgsim_env.palpation.member_chart import member_map, still_template
 from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
 from surgsim_env.palpation.site_press import PressResult
 from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SiteTouches, Touch, felt_lesion_radius
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.family import family_of
-from surgsim_env.scene.levels import REFERENCE_TIP, DrawnOrgan, Level, find_level
-from surgsim_env.scene.load import make_scene, with_instrument
-from surgsim_env.scene.motions import with_motion
-from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
-from surgsim_env.tasks.task import InfoValue, Start, Task, soft_force_share
+from surgsim_env.scene.levels import REFERENCE_TIP
+from surgsim_env.tasks.channels import soft_force_share
+from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, Setup
+from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
 # Presses of an episode; BUDGET_WIDE where the chart's longer side exceeds WIDE tip radii.
 BUDGET, BUDGET_WIDE, WIDE = 25, 60, 10.0
@@ -214,16 +208,13 @@ class PalpateSitesTask(Task):
             lambda task, step: 1.0 - task.step_count / task.budget,
         ),
     )  # fmt: skip
-    kept = ("given_budget", "record")
     # The budget ends an episode.
-    episode_steps = None
-    drawn: DrawnOrgan | None
+    setup = Setup(level="standard", episode_steps=None)
+    kept = ("given_budget", "record")
 
     def __init__(
         self,
-        anatomy: Anatomy,
-        level: Level,
-        healthy: HealthyMap,
+        scenario: Scenario,
         *,
         memory: bool = True,
         budget: int | None = None,
@@ -231,17 +222,15 @@ class PalpateSitesTask(Task):
     ) -> None:
         """Palpate an anatomy; a press is simulated or looked up, everything else is computed here.
 
-        An episode: `reset`; for each press `begin`, `site`, `take` with the result of the press, `observe`, `judge`.
+        For each press the environment asks for its `site` and calls `take` with its result.
 
         Attributes that agents and scores may read: `estimator` (the benchmark's common estimator, on the lengths of
-        `charted.chart`), `budget`, `step_count`, `felt` (record of the presses), `estimate`, `estimated` (where it is
-        on the face [m] (k, 3)), `truth` (the face's points nearest to the lesions' centres [m] (n_lesion, 3)), `error`
+        `charted.chart`), `budget`, `step_count`, `felt` (record of the presses), `estimate`, `estimated` (its places on
+        the face [m] (k, 3)), `truth` (the face's points nearest to the lesions' centres [m] (n_lesion, 3)), `error`
         (OSPA [m]), `found` (share of the lesions with an estimate near them).
 
         Args:
-            anatomy: of a scene that `level.scene` gave.
-            level: what an episode draws.
-            healthy: stiffness of the scene's healthy organ over its chart.
+            scenario: with a level.
             memory: observe all presses; else the last one alone.
             budget: presses of an episode; by default 25, or 60 where the chart's longer side is above ten tip radii.
             track_motion: presses go with a surface that moves.
@@ -249,29 +238,25 @@ class PalpateSitesTask(Task):
         Raises:
             ValueError: a budget that is no whole number above 0.
         """
-        super().__init__(anatomy)
-        scene, tip = anatomy.scene, anatomy.scene.instrument.tip_radius
-        self.level, self.memory, self.track_motion = level, memory, track_motion
-        # What member maps are made from, of a family: its template with the probe and without motion.
-        self.still: Anatomy | None = None
+        super().__init__(scenario)
+        scene, tip = self.anatomy.scene, self.anatomy.scene.instrument.tip_radius
+        self.memory, self.track_motion = memory, track_motion
         if budget is not None and budget < 1:
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
         self.given_budget = budget
         self.reading = ForceReading(scene.sensor)
         self.cutoff, self.tip_scale = ospa_cutoff(tip), tip / REFERENCE_TIP
-        self._take_map(healthy)
+        assert scenario.level is not None and scenario.scene is not None
+        # The healthy maps of the scene and of a family's members belong to this anatomy.
+        self._still = still_template(scenario.level.healthy(scenario.scene))
+        self._chart()
 
-    def take_anatomy(self, anatomy: Anatomy) -> None:
-        """As `Task.take_anatomy`, with the chart of the member's face, its healthy map, estimator and budget."""
-        super().take_anatomy(anatomy)
-        assert anatomy.member is not None and self.still is not None
-        self._take_map(member_map(self.still, anatomy.member))
-
-    def _take_map(self, healthy: HealthyMap) -> None:
-        """Palpate the present anatomy, whose healthy map is given."""
-        scene = self.anatomy.scene
-        self.charted = charted_face(self.anatomy)
+    def _chart(self) -> None:
+        """Take the chart of the anatomy's face, its healthy map, estimator and budget."""
+        anatomy, scene = self.anatomy, self.anatomy.scene
+        self.charted = charted_face(anatomy)
         chart = self.charted.chart
+        healthy = healthy_map_of(self._still) if anatomy.member is None else member_map(self._still, anatomy.member)
         wide = chart.extent.max() > WIDE * scene.instrument.tip_radius
         self.budget = self.given_budget if self.given_budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
@@ -283,76 +268,40 @@ class PalpateSitesTask(Task):
             map_spread=0.0 if scene.mesh.block is not None else ORGAN_MAP_SPREAD,
         )
         self.truth = np.zeros((0, 3))
-        self._clear()
-
-    def _clear(self) -> None:
-        self.felt.clear()
-        self.step_count = 0
-        self._pending: tuple[Site, PressResult] | None = None
         self._believe()
-        self._reached = {"found": self.found}
 
     # ---- the episode ------------------------------------------------------------------------------------------------
 
-    @classmethod
-    def make(
-        cls,
-        scene: str,
-        instrument: str | None = None,
-        *,
-        motion: str | None = None,
-        level: str | None = "standard",
-        memory: bool = True,
-        budget: int | None = None,
-        split: str | None = None,
-        **settings: Any,
-    ) -> tuple[Simulation, Self]:
-        """As `Task.make`, with the map of the scene's healthy organ."""
-        chosen, plain = find_level(level or "standard"), make_scene(scene)
-        moving = with_motion(with_instrument(plain, instrument), motion or chosen.motion)
-        anatomy = load_anatomy(chosen.scene(moving))
-        family = family_of(anatomy, split)
-        still = still_template(chosen.healthy(plain))
-        task = cls(anatomy, chosen, healthy_map_of(still), memory=memory, budget=budget, **settings)
-        task.family, task.still = family, still
-        return Simulation(anatomy), task
-
-    def reset(self, rng: np.random.Generator) -> Start:
-        """Draw the organ and the sensor's bias; the tip waits above the middle of the chart."""
-        assert self.level is not None
-        drawn = self.drawn = self.level.draw(self.anatomy, rng)
-        self.truth = drawn.places(self.anatomy)
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw the sensor's bias and the map's error; the tip waits above the middle of the chart."""
+        if self.charted is not charted_face(self.anatomy):
+            self._chart()
+        self.truth = self.drawn.places(self.anatomy)
         self.reading.reset(rng)
+        assert self.level is not None
         if self.level.map_error:
             self.felt.map_shift = rng.normal(0.0, self.level.map_error, 2)
-        self._clear()
+        self.felt.clear()
+        self._believe()
         middle, scene = self.charted.site(np.zeros(2)), self.anatomy.scene
         gap = scene.instrument.tip_radius + scene.palpation.clearance
-        return Start(drawn.compiled(self.anatomy), middle.point + middle.normal * gap)
+        return middle.point + middle.normal * gap
 
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
+    def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
         """Nothing: a press commands the instrument itself."""
 
     def site(self, action: FloatArray) -> Site:
         """The site that an action (2,) asks to press, or the nearest that may be pressed."""
         return self.charted.site(np.clip(action, -1.0, 1.0))
 
-    def take(self, site: Site, result: PressResult) -> None:
-        """Take the result of a press at a site; `observe` reads the sensor."""
-        self._pending = (site, result)
-
-    def observe(self, simulation: Simulation | None, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """The observation after the last press that was taken, and whether the sensor saturated."""
-        saturated = False
-        if self._pending is not None:
-            (site, result), self._pending = self._pending, None
-            # Between presses the sensor bears nothing.
-            self.reading.follow(np.zeros(3))
-            reading, saturated = self.reading.read(result.force, rng, self.felt.seconds)
-            self.felt.add(site, result, float(matmul(reading, site.normal)))
-            self._believe()
-        # A press that was looked up has no simulation, and no channel reads it.
-        return super().observe(simulation, rng)[0], saturated  # type: ignore[arg-type]
+    def take(self, site: Site, result: PressResult, rng: np.random.Generator) -> bool:
+        """Take the result of a press at a site through the sensor; returns whether that saturated."""
+        # Between presses the sensor bears nothing.
+        self.reading.follow(np.zeros(3))
+        reading, saturated = self.reading.read(result.force, rng, self.felt.seconds)
+        self.felt.add(site, result, float(matmul(reading, site.normal)))
+        self._believe()
+        return saturated
 
     def _believe(self) -> None:
         """Estimate the lesions from all touches, and compare with the truth."""
@@ -378,10 +327,11 @@ class PalpateSitesTask(Task):
             return ""
         return "success" if self.error <= SUCCESS_ERROR * self.tip_scale else "done"
 
-    def measures(self) -> dict[str, InfoValue]:
-        """The last press, and the estimate so far."""
+    def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
+        """As `Task.info`, with the last press and the estimate so far."""
         last: Touch = self.felt.last
         return {
+            **super().info(step, end),
             "force": last.force,
             "depth": last.depth,
             "stiffness": last.stiffness,
@@ -405,26 +355,9 @@ class PalpateSitesTask(Task):
 
     @record.setter
     def record(self, table: dict[str, Any]) -> None:
+        if self.charted is not charted_face(self.anatomy):
+            self._chart()
         self.reading = ForceReading(self.reading.sensor, table["bias"])
         self.felt.set_state(table)
-
-    def saved_organ(self, text: str, anatomy: Anatomy) -> OrganModel:
-        """As `Task.saved_organ`.
-
-        Raises:
-            ValueError: also if the episode has another budget, which what is observed and paid goes with.
-        """
-        organ, given = super().saved_organ(text, anatomy), json.loads(text)["kept"]["given_budget"]
-        if given != self.given_budget:
-            raise ValueError(
-                f"the state is of an episode with budget={given}, this environment has budget={self.given_budget}: "
-                "make it with that"
-            )
-        return organ
-
-    def set_state(self, text: str, anatomy: Anatomy) -> None:
-        """As `Task.set_state`; the estimate follows from what was felt."""
-        super().set_state(text, anatomy)
-        assert self.drawn is not None
-        self.truth, self._pending = self.drawn.places(anatomy), None
+        self.truth = self.drawn.places(self.anatomy)
         self._believe()

@@ -15,23 +15,20 @@ from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Grasp, Instrument
-from surgsim_env.scene.anatomy import Anatomy, load_anatomy
-from surgsim_env.scene.load import fill, make_retract_scene, with_instrument
+from surgsim_env.scene.anatomy import Anatomy
+from surgsim_env.scene.levels import Level
+from surgsim_env.scene.load import fill, make_retract_scene
 from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vector
-from surgsim_env.scene.motions import with_motion
-from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward
-from surgsim_env.tasks.task import (
+from surgsim_env.tasks.channels import (
     LENGTH_SCALE,
-    SPEED_FULL_SCALE,
     TIME_LEFT,
     TIP_POSITION,
     TIP_VELOCITY,
-    InfoValue,
-    Start,
-    Task,
     force_scale,
     soft_force_share,
 )
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, Channel, Command, ControlStep, Reward, Setup
+from surgsim_env.tasks.task import InfoValue, Pictured, Scenario, Task
 from surgsim_env.tasks.visibility import Disc, hiding_geoms, visible
 
 EPISODE_STEPS = 600
@@ -92,6 +89,26 @@ class RetractionDraw:
     start: Vector
     # A lobe has none.
     lesions: ClassVar[tuple[Lesion, ...]] = ()
+
+    @classmethod
+    def draw(
+        cls,
+        anatomy: Anatomy,
+        rng: np.random.Generator,
+        level: Level | None = None,
+        lesion_count: int | tuple[int, int] | None = None,
+    ) -> Self:
+        """Draw from the ranges of a scene's [retract] table, around its endoscope; a lobe has no lesions."""
+        table, endoscope = anatomy.scene.retract, anatomy.scene.endoscope
+        assert table is not None and endoscope is not None
+        scale, modulus = float(rng.uniform(*table.scale)), float(rng.uniform(*table.youngs_modulus))
+        capsule = float(rng.uniform(*table.capsule_stiffness)) if rng.uniform() < table.capsule_share else 0.0
+        held = float(rng.uniform(*table.held_share))
+        along, distance = float(rng.uniform(*table.target_along)), float(rng.uniform(*table.target_distance))
+        eye, looks_at = _moved(endoscope, table.camera, rng)
+        start = rng.uniform(table.start_lower, table.start_upper)
+        target = (along, distance, TARGET_LIFT)
+        return cls(scale, modulus, capsule, held, target, _vector(eye), _vector(looks_at), _vector(start))
 
     def to_json(self) -> str:
         """The draw as JSON, with numbers written exactly."""
@@ -176,7 +193,10 @@ class RetractTask(Task):
             "turning", lambda task: task.turning_size, TURNING_FULL_SCALE, "rad/s", "rotation of the tip",
             size_text="0, 1 or 3",
         ),
-        Command("jaw", 1, meaning="target of the jaw, which moves at its limited speed: -1 closed, 1 open"),
+        Command(
+            "jaw", 1, meaning="target of the jaw, which moves at its limited speed: -1 closed, 1 open",
+            default=lambda task: task.jaw_target,
+        ),
     )  # fmt: skip
     channels: ClassVar[tuple[Channel, ...]] = (
         replace(TIP_POSITION, bounds_text="the lobe's bounding box with a margin"),
@@ -259,21 +279,22 @@ class RetractTask(Task):
         Reward("fault", -12.0, "failure", "the simulation could not go on"),
         Reward("forgone", -0.015, "step left", "the most expensive control step, so that a failure pays less"),
     )  # fmt: skip
-    default_scene = "lobe"
-    episode_steps = EPISODE_STEPS
+    setup: ClassVar[Setup] = Setup(
+        scene="lobe", episode_steps=EPISODE_STEPS, load=make_retract_scene, drawn=RetractionDraw
+    )
+    kept = ("goal_count", "jaw_target", "visible_share", "measured")
     # Whether two arms do it.
     takes_pair: ClassVar[bool] = False
-    kept = ("goal_count", "jaw_target", "visible_share", "measured")
-    draw_class = RetractionDraw
     drawn: RetractionDraw | None
 
-    def __init__(self, anatomy: Anatomy, instrument: Instrument) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         """Retract the lobe of an anatomy.
 
         Raises:
             ValueError: a scene without a [retract] table or an endoscope, an instrument without a jaw or of two arms.
         """
-        scene = anatomy.scene
+        anatomy, scene, instrument = scenario.anatomy, scenario.anatomy.scene, scenario.instrument
+        assert instrument is not None
         self.table, self._endoscope = _checked_scene(anatomy)
         if scene.family is not None:
             raise ValueError(
@@ -292,7 +313,7 @@ class RetractTask(Task):
                 f"scene {scene.name!r}: instrument {scene.instrument.model!r} has no jaw to grasp with; "
                 'take one that has, such as instrument="psm_retractor"'
             )
-        super().__init__(anatomy, instrument)
+        super().__init__(scenario)
         self.turning_size = instrument.turning_size
         self.tracked_nodes = _nearest_nodes(anatomy.mesh.points, lifted_box(self.table, anatomy.mesh.points))
         self._hiding = hiding_geoms(instrument.model)
@@ -302,20 +323,6 @@ class RetractTask(Task):
         self.jaw_target = 1.0
         self.visible_share = 0.0
 
-    @classmethod
-    def make(
-        cls, scene: str, instrument: str | None = None, *, motion: str | None = None, **settings: Any
-    ) -> tuple[Simulation, Self]:
-        """As `Task.make`, from the scene of retraction that a scene is or names; there are no levels."""
-        anatomy = load_anatomy(with_motion(with_instrument(make_retract_scene(scene), instrument), motion))
-        simulation = Simulation(anatomy)
-        return simulation, cls(anatomy, simulation.instrument, **settings)
-
-    @property
-    def pull_limit(self) -> float:
-        """Pull of the jaw at which tissue tears [N]."""
-        return self.limits.tear_force
-
     @property
     def target(self) -> Disc | None:
         """The disc to uncover, on its bed at rest; None before the first episode."""
@@ -324,30 +331,18 @@ class RetractTask(Task):
         return Disc(np.array(self.drawn.target), np.array([0.0, 0.0, 1.0]), self.table.target_radius)
 
     @property
-    def endoscope(self) -> Endoscope | None:
-        """Pose of the endoscope in this episode; None before the first."""
+    def pictured(self) -> Pictured:
+        """The disc to uncover, and the pose of the endoscope in this episode; none before the first."""
         if self.drawn is None:
-            return None
-        return Endoscope(self.drawn.eye, self.drawn.looks_at, self._endoscope.fov_deg)
+            return Pictured()
+        return Pictured(self.target, Endoscope(self.drawn.eye, self.drawn.looks_at, self._endoscope.fov_deg))
 
     # ---- actions -----------------------------------------------------------------------------------------------
 
-    @property
-    def jaw_place(self) -> int:
-        """Index of the jaw's target in an action."""
-        return self.action_slices["jaw"].start
-
-    def action(self, velocity: FloatArray | None = None, **commands: Any) -> FloatArray:
-        """As `Task.action`; a jaw target that is left out (or None) is the last one."""
-        if commands.get("jaw") is None:
-            commands["jaw"] = self.jaw_target
-        return super().action(velocity, **commands)
-
-    def command(self, action: FloatArray, instrument: Instrument) -> None:
+    def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
         """Set the tip's velocity and rotation, and the jaw's target."""
-        turning = self.commanded(action, "turning") if self.turning_size else None
-        instrument.command_velocity(self.commanded(action, "velocity"), turning)
-        self.command_jaw(float(action[self.jaw_place]), instrument)
+        instrument.command_velocity(commands["velocity"], commands.get("turning"))
+        self.command_jaw(float(commands["jaw"][0]), instrument)
 
     def command_jaw(self, target: float, instrument: Instrument) -> None:
         """Set the jaw's target, limited to [-1, 1]: an action may exceed that by rounding."""
@@ -356,30 +351,29 @@ class RetractTask(Task):
 
     # ---- an episode --------------------------------------------------------------------------------------------
 
-    def reset(self, rng: np.random.Generator) -> Start:
-        """Draw the lobe, the target, the endoscope, the sensors' biases and the tip's start."""
-        self.drawn = draw_retraction(self.table, self._endoscope, rng)
-        for name in ("contact_force", "contact_torque"):
-            self.sensors[name].reset(rng)
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Forget the last episode; the tip's place was drawn with the lobe."""
+        assert self.drawn is not None
         self.record = RetractionRecord()
-        self.step_count = self.goal_count = 0
-        self.jaw_target = 1.0
-        return Start(self.drawn.compiled(self.anatomy), np.array(self.drawn.start))
+        self.goal_count, self.jaw_target = 0, 1.0
+        return np.array(self.drawn.start)
 
     def accepts(self, simulation: Simulation) -> bool:
         """Whether the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
         self.look(simulation)
-        return super().accepts(simulation) and self.visible_share <= HIDDEN_SHARE
+        return self.visible_share <= HIDDEN_SHARE
 
     def look(self, simulation: Simulation) -> None:
-        """Read what the jaw holds and how much of the target is visible."""
+        """Read the grasp and the visible share of the target."""
         self.grasp = simulation.grasp
         self.visible_share = self._look(simulation)
 
     def update(self, step: ControlStep) -> None:
-        """Add a control step to the record."""
+        """Look, and add a control step to the record."""
         simulation = step.simulation
-        self.grasp = simulation.grasp
+        self.look(simulation)
+        if self.step_count == 0:
+            return
         assert self.grasp is not None
         box = lifted_box(self.table, simulation.organ_model.node_rest_position)
         strain = region_strains(simulation.organ_model, simulation.organ_state.node_position, box)
@@ -398,9 +392,9 @@ class RetractTask(Task):
         """Name of the failure that a control step caused; "" for none."""
         if step.fault:
             return "fault"
-        if step.simulation.pull_peak > self.pull_limit:
+        if step.simulation.pull_peak > self.limits.tear_force:
             return "torn"
-        return "hard_force" if step.force_peak > self.force_limit else ""
+        return "hard_force" if step.force_peak > self.limits.hard_force else ""
 
     def at_goal(self, simulation: Simulation) -> bool:
         """Whether the state is the one that has to last for SUCCESS_TIME."""
@@ -491,18 +485,6 @@ def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> ND
 CAPSULE_THICKNESS = 1e-4
 # A target lies this far above its bed [m], so that the bed does not hide it.
 TARGET_LIFT = 1e-4
-
-
-def draw_retraction(table: Retraction, endoscope: Endoscope, rng: np.random.Generator) -> RetractionDraw:
-    """Draw an episode from the ranges of a scene's table, around the scene's endoscope."""
-    scale, modulus = float(rng.uniform(*table.scale)), float(rng.uniform(*table.youngs_modulus))
-    capsule = float(rng.uniform(*table.capsule_stiffness)) if rng.uniform() < table.capsule_share else 0.0
-    held = float(rng.uniform(*table.held_share))
-    along, distance = float(rng.uniform(*table.target_along)), float(rng.uniform(*table.target_distance))
-    eye, looks_at = _moved(endoscope, table.camera, rng)
-    start = rng.uniform(table.start_lower, table.start_upper)
-    target = (along, distance, TARGET_LIFT)
-    return RetractionDraw(scale, modulus, capsule, held, target, _vector(eye), _vector(looks_at), _vector(start))
 
 
 def lifted_box(table: Retraction, points: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from surgsim_apps.scoring.comparison import compare, describe
+from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.results import SITES, Result
-from surgsim_env.palpation.scores import ScoreEstimate
 
 pytestmark = pytest.mark.agents
 SEEDS = tuple(range(1_000_000, 1_000_040))
@@ -45,7 +45,7 @@ def test_the_same_method_differs_by_nothing():
     one = result("one", falling(np.random.default_rng(0).integers(1, 12, 40)))
     for difference in compare(one, replace(one, method="other"), np.random.default_rng(0)):
         assert difference.difference == ScoreEstimate(0.0, 0.0, 0.0), difference
-        assert difference.one == difference.other
+        assert difference.first == difference.second
 
 
 def test_a_method_that_takes_two_presses_more_in_every_episode():
@@ -83,7 +83,7 @@ def test_episodes_without_lesions_do_not_count_for_presses():
     errors = falling(np.repeat([2, 9], 20))
     one = result("one", errors, lesion_counts=[1] * 20 + [0] * 20)
     first, *_ = compare(one, one, np.random.default_rng(0))
-    assert first.one == 2.0
+    assert first.first == 2.0
 
 
 @pytest.mark.parametrize(

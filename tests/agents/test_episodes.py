@@ -19,8 +19,8 @@ from surgsim_apps.scoring.episodes import (
     play_tasks,
     site_success,
 )
+from surgsim_apps.scoring.figures import MapScore, press_errors
 from surgsim_apps.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
-from surgsim_env.palpation.scores import MapScore, press_errors
 from surgsim_env.rendering import gl
 from surgsim_env.tasks.palpate import EPISODE_STEPS
 
@@ -82,9 +82,9 @@ def test_lanes_without_a_seed_are_not_stepped(monkeypatch: pytest.MonkeyPatch):
     stepped = []
     singles = envs.unwrapped.envs  # type: ignore[attr-defined]
     for number, single in enumerate(singles):
-        inner = single.unwrapped.begin_press
+        inner = single.unwrapped.begin
         monkeypatch.setattr(
-            single.unwrapped, "begin_press", lambda action, n=number, inner=inner: stepped.append(n) or inner(action)
+            single.unwrapped, "begin", lambda action, n=number, inner=inner: stepped.append(n) or inner(action)
         )
     records = play_sites(AgentActor(Counting), envs, seeds)
     assert len(Counting.acted) == 3 * 2 and sorted(stepped) == [0, 0, 0, 0, 1, 1]

@@ -16,6 +16,7 @@ import pytest
 from agents import leaderboard
 from surgsim_apps.scoring import evaluate
 from surgsim_apps.scoring.evaluate import policies_folder
+from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.options import ScoringOptions
 from surgsim_apps.scoring.results import (
     SITES,
@@ -26,7 +27,6 @@ from surgsim_apps.scoring.results import (
     seeds_text,
     shipped_results,
 )
-from surgsim_env.palpation.scores import ScoreEstimate
 from surgsim_env.scene.digest import PHYSICS_VERSION
 from surgsim_env.scene.load import scenes_folder
 from tests.agents.commands import surgsim

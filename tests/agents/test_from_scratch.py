@@ -146,7 +146,7 @@ def test_the_touch_summary_is_what_it_says():
     features = extractor(torch.tensor(observation)).numpy()
     assert features.shape == (8, extractor.features_dim) == (8, 16)
     env = envs.get_attr("unwrapped", indices=[0])[0]
-    channel = {name: env.si_values(observation)[:, part] for name, part in env.task.observation_slices.items()}
+    channel = {name: env.si_values(observation)[:, part] for name, part in env.layout.observation_slices.items()}
     felt = channel["visited"].sum(axis=1)
     assert (felt > 0).any()
     for row in np.flatnonzero(felt):

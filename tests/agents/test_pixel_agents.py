@@ -14,9 +14,8 @@ import torch
 
 import surgsim_env  # noqa: F401
 from agents.learn_retract import IMAGINED_PULL, UNHELD_PULLS, Player
-from surgsim_apps.scoring import expert_retract
 from surgsim_apps.scoring.evaluate import policies_folder
-from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, PULL_MOST, PUSH_MOST, SLICES, TIP, TolerantExpert
+from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PLAN, PULL, SLICES, TIP, RetractExpert, TolerantExpert
 from surgsim_apps.training.picture_features import PictureAndForce
 from surgsim_apps.training.policy_files import load_policy
 from surgsim_env.rendering import gl
@@ -85,14 +84,14 @@ def held_lobe(pull: float) -> np.ndarray:
 
 def test_the_teacher_gives_way_to_a_hard_pull():
     """Back towards the place between lifting and folding, the jaw closed; below the limit it goes on folding."""
-    teacher, limit = TolerantExpert(grasp_along=0.04), PULL_MOST
+    teacher, limit = TolerantExpert(grasp_along=0.04), PLAN.pull_most
     goes_on, gives_way = (teacher.act(held_lobe(limit + change)) for change in (-0.01, 0.01))
-    back, on = (np.array(goal) - [0.030, 0.045] for goal in (expert_retract.RISEN, expert_retract.FOLDED))
+    back, on = (np.array(goal) - [0.030, 0.045] for goal in (PLAN.risen, PLAN.folded))
     for action, way in ((gives_way, back), (goes_on, on)):
         assert action[1:3] @ way > 0.99 * np.linalg.norm(action[1:3]) * np.linalg.norm(way) > 0.0
         assert action[3] == 0.0 and action[4] == -1.0
     # Where the edge has slipped out of the jaw, the pads still push: outwards, and the jaw opens.
-    slipped = [held_lobe(PUSH_MOST + change) for change in (-0.01, 0.01)]
+    slipped = [held_lobe(PLAN.push_most + change) for change in (-0.01, 0.01)]
     for observation in slipped:
         observation[HOLDS] = 0.0
     still_in, away = (teacher.act(observation) for observation in slipped)
@@ -100,8 +99,8 @@ def test_the_teacher_gives_way_to_a_hard_pull():
     assert not np.array_equal(still_in, away)
     # The plain expert pulls on.
     np.testing.assert_array_equal(
-        expert_retract.RetractExpert().act(held_lobe(limit + 0.01))[:3],
-        expert_retract.RetractExpert().act(held_lobe(0.3))[:3],
+        RetractExpert().act(held_lobe(limit + 0.01))[:3],
+        RetractExpert().act(held_lobe(0.3))[:3],
     )
 
 
@@ -139,7 +138,7 @@ def test_imagined_pulls_scale_all_readings_but_the_grip_and_are_labelled():
         state[[HOLDS, GRIP]] *= not gone
         np.testing.assert_array_equal(action, player.expert.act(state))
     # Where the edge has slipped out, the teacher goes back with an open jaw.
-    back = actions[slipped & (made > PUSH_MOST)]
+    back = actions[slipped & (made > PLAN.push_most)]
     assert len(back) and (back == np.float32([0.0, 0.75, 0.0, 0.0, 1.0])).all()
 
 

@@ -19,7 +19,9 @@ from surgsim_apps.training.recorded_faces import (
 from surgsim_apps.training.site_agent import observed_facts
 from surgsim_apps.training.site_surrogate import SiteSurrogate
 from surgsim_env.palpation.chart import MAP_SIDE, interpolated
+from surgsim_env.tasks.declaration import reward_weights
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
+from surgsim_env.tasks.runtime import TaskRuntime
 
 pytestmark = pytest.mark.agents
 FACES = Path(script.__file__).parent / "faces"
@@ -57,8 +59,8 @@ def test_pressing_everywhere_finds_lesions_and_pays_them_once():
     while not over:
         _, reward, over, _, info = env.step(sites[rng.integers(len(sites))].astype(np.float32))
         total += reward
-    gained = PalpateSitesTask.weights["found"] * (env.found - found)
-    assert gained + PalpateSitesTask.weights["error"] <= total <= gained and info["error_mm"] >= 0.0
+    gained = reward_weights(PalpateSitesTask)["found"] * (env.found - found)
+    assert gained + reward_weights(PalpateSitesTask)["error"] <= total <= gained and info["error_mm"] >= 0.0
 
 
 def test_draws_are_of_all_faces():
@@ -105,7 +107,8 @@ def test_each_batch_is_drawn_as_the_first(few_presses, tmp_path, monkeypatch):
 
 
 def test_a_press_beyond_the_hard_limit_ends_the_recording(few_presses, monkeypatch):
-    monkeypatch.setattr(PalpateSitesTask, "force_limit", 0.02)
+    monkeypatch.setattr(TaskRuntime, "force_limit", 0.02)
+    monkeypatch.setattr(PalpateSitesTask, "end", lambda _, step: "hard_force" if step.force_peak > 0.02 else "")
     with pytest.raises(RuntimeError, match=rf"episode {FIRST_SEED}, site \d+: the press ended it, .* the hard limit"):
         record_faces("phantom_small", None, "standard", 1)
 

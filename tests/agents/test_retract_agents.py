@@ -65,9 +65,8 @@ def test_forces_are_those_entries_of_the_observation():
     """Where the jaw presses tissue, they alone tell the wrench, grip and pull."""
     env = gym.make(ID, scaled=False)
     observation, _ = env.reset(seed=3)
-    task = env.unwrapped.task  # type: ignore[attr-defined]
-    assert task.force_entries == list(range(13, 21))
-    np.testing.assert_array_equal(observation[13:16], task.sensed_force(observation).astype(np.float32))
+    assert env.unwrapped.layout.force_entries == list(range(13, 21))
+    np.testing.assert_array_equal(observation[13:16], env.unwrapped.layout.sensed_force(observation).astype(np.float32))
     assert observation[19] == observation[20] == 0.0 and observation[21] == 0.0
 
 

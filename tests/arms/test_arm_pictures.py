@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from surgsim_apps.arms.arm_picture import filling_camera
 from surgsim_apps.arms.study import evaluate_arms
 from surgsim_env.rendering import gl
 from surgsim_env.step_progress import StepProgress
@@ -36,3 +37,16 @@ def test_without_opengl_no_picture_and_a_word(monkeypatch):
     picture, told = evaluate()
     assert picture is None
     assert "no picture: MUJOCO_GL is 'off', which switches OpenGL off" in told
+
+
+@pytest.mark.parametrize("size", [(640, 480), (300, 600)])
+def test_a_filled_picture_has_all_points_and_no_more_room(size):
+    """Points touch both edges of its middle share along one axis."""
+    places = np.random.default_rng(3).normal(size=(60, 3)) * [1.0, 0.3, 0.5] + [4.0, -1.0, 2.0]
+    camera = filling_camera(places, np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, 1.0]), 30.0, size[0] / size[1], 0.9)
+    pixels, depth = camera.project(places, *size)
+    assert (depth > 0.0).all()
+    at = 2.0 * pixels / size - 1.0
+    assert np.abs(at).max() == pytest.approx(0.9, abs=1e-9)
+    wide = int(np.argmax(np.ptp(at, axis=0)))
+    assert (at[:, wide].min(), at[:, wide].max()) == pytest.approx((-0.9, 0.9), abs=1e-9)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from surgsim_apps.arms.results import rank
+from surgsim_apps.arms.ranking import rank
 from tests.arms.made import made_cycle, made_evaluation
 
 

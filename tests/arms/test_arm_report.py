@@ -10,15 +10,11 @@ import pytest
 from matplotlib.image import imread
 
 from surgsim_apps.arms.pictures import ArmMaps, write_picture
-from surgsim_apps.arms.results import (
-    QUANTITIES,
-    REASONS,
-    columns,
-    verdict,
-    worse_of_both,
-    write_points,
-)
-from surgsim_apps.arms.study import write_report
+from surgsim_apps.arms.points_file import columns, write_points
+from surgsim_apps.arms.quantities import QUANTITIES
+from surgsim_apps.arms.report import write_report
+from surgsim_apps.arms.results import REASONS
+from surgsim_apps.arms.wording import number_text, verdict
 from tests.arms.made import PICTURE, made_evaluation
 
 VOID = {"meta", "link", "img", "br"}
@@ -102,7 +98,7 @@ def test_tables_show_least_median_and_greatest(evaluation, page):
         worse = pair.min(axis=0) if quantity.more_is_better else pair.max(axis=0)
         arrays.append(np.where(evaluation.both, worse, np.nan))
         wanted = [
-            quantity.text(float(pick(values)), with_unit=False)
+            number_text(float(pick(values)), quantity.scale, quantity.digits)
             for values in arrays
             for pick in (np.nanmin, np.nanmedian, np.nanmax)
         ]
@@ -127,7 +123,7 @@ def test_the_worse_of_both_is_the_less_useful(evaluation):
     for field, pick in (("tip_force", np.minimum), ("trocar_load", np.maximum)):
         quantity = next(one for one in QUANTITIES if one.field == field)
         wanted = pick(getattr(evaluation.left, field), getattr(evaluation.right, field))[evaluation.both]
-        found = worse_of_both(evaluation, quantity)
+        found = quantity.worse_of_both(evaluation)
         np.testing.assert_array_equal(found[evaluation.both], wanted)
         assert np.isnan(found[~evaluation.both]).all()
 
@@ -135,7 +131,7 @@ def test_the_worse_of_both_is_the_less_useful(evaluation):
 def test_points_come_back_from_the_table(evaluation, folder):
     with (folder / "points.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert list(rows[0]) == columns(evaluation)
+    assert list(rows[0]) == list(columns(evaluation))
     assert len(rows) == len(evaluation.points)
 
     def read(name):

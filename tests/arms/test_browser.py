@@ -9,8 +9,8 @@ import pytest
 from matplotlib.image import imread
 
 from surgsim_apps.arms.pictures import ArmMaps, write_picture
-from surgsim_apps.arms.results import rank
-from surgsim_apps.arms.study import write_report
+from surgsim_apps.arms.ranking import rank
+from surgsim_apps.arms.report import write_report
 from surgsim_apps.reports.html_page import POLICY
 from tests.arms.made import made_evaluation
 from tests.chromium import Browser

@@ -8,11 +8,12 @@ import pytest
 
 from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
+from surgsim_apps.arms.points_file import columns, write_points
 from surgsim_apps.arms.ports import EndoscopePort, PortPlace, Ports, Wall
 from surgsim_apps.arms.reach import Sites, evaluate_both, evaluate_reach
-from surgsim_apps.arms.results import columns, write_points
-from surgsim_apps.arms.study import evaluate_arms, write_report
-from surgsim_apps.arms.through_cycle import cycle_section, evaluate_cycle, make_cycle
+from surgsim_apps.arms.report import cycle_section, write_report
+from surgsim_apps.arms.study import evaluate_arms
+from surgsim_apps.arms.through_cycle import evaluate_cycle, make_cycle
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
@@ -104,7 +105,7 @@ def test_the_table_of_points_holds_the_cycle(evaluation, tmp_path):
     write_points(evaluation, tmp_path / "points.csv")
     with (tmp_path / "points.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    assert list(rows[0]) == columns(evaluation)
+    assert list(rows[0]) == list(columns(evaluation))
     cycle = evaluation.cycle
     for index, row in enumerate(rows):
         assert row["left_always"] == str(int(cycle.left.always[index]))

@@ -192,9 +192,9 @@ def test_lanes_stop_at_the_pull_limit_too():
         for pair in (together, apart):
             pair[0].instrument.command_velocity(np.array([0.0, 0.02, 0.01]))
             pair[1].instrument.command_velocity(np.zeros(3))
-        group.control_step(np.ones(2, dtype=bool), 50, np.inf, 0.25)
+        group.control_step(together, 50, np.inf, 0.25)
         for one, other in zip(together, apart, strict=True):
-            assert one.control_step(50) == other.control_step(50, np.inf, 0.25)
+            assert one.force_peak == other.control_step(50, np.inf, 0.25) == other.force_peak
             assert one.pull_peak == other.pull_peak
             assert one.time == other.time
             one.instrument.refresh()

@@ -11,7 +11,7 @@ import pytest
 import msdm_core
 import surgsim_env.scripting
 from surgsim_env.envs.ids import TASKS
-from surgsim_env.tasks.declaration import docstring_sections
+from surgsim_env.tasks.declaration import docstring_sections, reward_weights
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -30,9 +30,11 @@ def hook(name: str):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT / "docs").as_posix())
 def test_files_and_modules_that_are_named_exist(page):
     text = page.read_text(encoding="utf-8")
-    for place in re.findall(r"`((?:scenes|msdm_core|surgsim_env|agents|docs|tests|benchmarks)/[\w/.]*)`", text):
+    folders = "scenes|msdm_core|surgsim_env|surgsim_apps|agents|docs|tests|benchmarks"
+    for place in re.findall(rf"`((?:{folders})/[\w/.]*)`", text):
         assert (ROOT / place).exists(), place
-    for name in re.findall(r"`((?:msdm_core|surgsim_env)(?:\.\w+)+)(?:\([^`]*)?`|^::: (\S+)", text, flags=re.MULTILINE):
+    packages = "msdm_core|surgsim_env|surgsim_apps"
+    for name in re.findall(rf"`((?:{packages})(?:\.\w+)+)(?:\([^`]*)?`|^::: (\S+)", text, flags=re.MULTILINE):
         assert resolved(name[0] or name[1]) is not None, name
 
 
@@ -102,7 +104,7 @@ def test_tables_have_every_command_channel_and_reward(id):
     ):  # fmt: skip
         rows = re.findall(r"^\| `(\w+)` \| (\S[^|]*) \|", told[heading], flags=re.MULTILINE)
         assert [name for name, _ in rows] == [part.name for part in parts]
-    assert {name: float(weight) for name, weight in rows} == dict(task.weights)
+    assert {name: float(weight) for name, weight in rows} == reward_weights(task)
 
 
 def test_every_command_and_every_option_is_on_the_page():

@@ -153,7 +153,7 @@ def test_it_runs(name, folder, capsys):
         pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
     text = page(name)
     if name in TRAINS_LAST:
-        text, training = text.split("\n## Train an agent\n")
+        text, training = text.split("\n## Training\n")
         assert "stable_baselines3" in training and "stable_baselines3" not in text
     run_tutorial(text, name, capsys)
 

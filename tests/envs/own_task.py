@@ -1,4 +1,4 @@
-"""The task of docs/tutorials/own_task.md, loaded as a user's own file."""
+"""The tasks of docs/tutorials/own_task.md, loaded as a user's own files."""
 
 import re
 import sys
@@ -6,12 +6,19 @@ import types
 from pathlib import Path
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "own_task.md"
+IDS = {"trace_path": "MyLab/TracePath-v0", "hold_force": "MyLab/HoldForce-v0"}
 
 
-def load_own_task() -> str:
-    """Run the tutorial's file as the module `trace_path`; returns the id that it registers."""
-    block = r'^```python title="trace_path.py"\n(.*?)^```$'
-    (code,) = re.findall(block, PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
-    module = sys.modules["trace_path"] = types.ModuleType("trace_path")
-    exec(compile(code, "trace_path.py", "exec"), vars(module))
-    return "MyLab/TracePath-v0"
+def own_task_code(name: str) -> str:
+    """The tutorial's file of a module."""
+    (code,) = re.findall(
+        rf'^```python title="{name}.py"\n(.*?)^```$', PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL
+    )
+    return code
+
+
+def load_own_task(name: str = "trace_path") -> str:
+    """Run the tutorial's file as a module; returns the id that it registers."""
+    module = sys.modules[name] = types.ModuleType(name)
+    exec(compile(own_task_code(name), f"{name}.py", "exec"), vars(module))
+    return IDS[name]

@@ -10,4 +10,4 @@ EMPTY = Grasp(opening=0.02, grip_force=0.0, pull_force=0.0, friction_left=0.0, h
 
 
 def act(env, velocity=(0.0, 0.0, 0.0), jaw=None, turning=None):
-    return env.step(env.task.action(np.array(velocity), jaw=jaw, turning=turning).astype(np.float32))
+    return env.step(env.layout.action(np.array(velocity), jaw=jaw, turning=turning).astype(np.float32))

@@ -9,6 +9,7 @@ from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.instrument import Grasp
 from surgsim_env.scene.load import pair_names
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
+from surgsim_env.tasks.declaration import ControlStep, reward_weights
 from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE
 
 HELD = Grasp(opening=0.01, grip_force=0.4, pull_force=0.1, friction_left=0.2, holds=True)
@@ -30,11 +31,12 @@ class Told:
     """A task's verdicts on what it is told was felt; nothing moves."""
 
     def __init__(self, env, monkeypatch):
-        self.task, self.simulation = env.task, env.simulation
+        self.task, self.runtime, self.simulation = env.task, env.runtime, env.simulation
         self.returned = 0.0
         self._tell({})
         monkeypatch.setattr(type(self.simulation), "grasp", property(lambda _: HELD if self.holds else EMPTY))
         monkeypatch.setattr(self.task, "_feel", self._feel)
+        monkeypatch.setattr(self.task, "_look", lambda _: self.uncovered)
         monkeypatch.setattr(self.task, "_from_target", lambda _: np.array([self.place, 0.0, 0.0]))
         monkeypatch.setattr(Pair, "collision_force", property(lambda _: self.collision))
 
@@ -50,9 +52,12 @@ class Told:
     def step(self, count=1, force_peak=0.0, fault="", **told):
         self._tell(told)
         for _ in range(count):
-            self.task.begin(np.zeros(13))
+            self.task.step_count += 1
             self._feel(None)
-            verdict = self.task.judge(self.simulation, force_peak, fault)
+            step = ControlStep(self.simulation, force_peak, fault)
+            if not fault:
+                self.task.update(step)
+            verdict = self.runtime.judge(step)
             self.returned += sum(verdict.rewards.values())
         return verdict
 
@@ -98,7 +103,7 @@ def test_harm_ends_it_and_is_named(told, harm, key):
 
 def test_the_weights_put_every_failure_below_every_full_episode():
     """The inequality of the table's comment."""
-    w = BimanualRetractTask.weights
+    w = reward_weights(BimanualRetractTask)
     gains = w["visible"] + w["grasped"] + w["near"] + w["touched"]
     assert w["forgone"] == pytest.approx(w["time"] + w["soft_force"])
     for failure in ("torn", "hard_force", "collided", "fault"):
@@ -109,13 +114,13 @@ def test_the_weights_put_every_failure_below_every_full_episode():
 @pytest.mark.parametrize("harm", [{"collision": 9.0}, {"force": 9.0}, {"force_peak": 9.0}, {"fault": "told so"}])
 def test_no_failed_episode_returns_more_than_the_worst_full_one(told, harm):
     start = {"visible": HIDDEN_SHARE, "grasped": 0.0, "near": 1.0, "touched": 0.0}
-    told.task._reached = dict(start)
+    told.runtime._reached = dict(start)
     lost = {"holds": False, "uncovered": 0.0, "place": 1.0, "force": 0.0}
-    assert told.step(EPISODE_STEPS, force_peak=told.task.force_limit, **lost).truncated
+    assert told.step(EPISODE_STEPS, force_peak=told.runtime.force_limit, **lost).truncated
     worst, told.returned = told.returned, 0.0
     for steps in (1, 5, 300, 600):
-        told.task.reset(np.random.default_rng(0))
-        told.task._reached, told.returned = dict.fromkeys(start, 0.0), 0.0
+        told.runtime.draw(np.random.default_rng(0))
+        told.runtime._reached, told.returned = dict.fromkeys(start, 0.0), 0.0
         for step in range(steps - 1):
             told.step(force=0.0 if step % 9 == 8 else 0.5)
         assert told.step(**harm).terminated
@@ -125,7 +130,7 @@ def test_no_failed_episode_returns_more_than_the_worst_full_one(told, harm):
 def test_both_arms_go_as_told_and_only_the_left_jaw_closes(env):
     pair = env.simulation.instrument
     tips = [pair.arms[side].tip_position for side in ("left", "right")]
-    action = env.task.action(np.array([0.0, 0.004, 0.0]), jaw=-1.0, right=np.array([0.002, 0.0, 0.004]))
+    action = env.layout.action(np.array([0.0, 0.004, 0.0]), jaw=-1.0, right=np.array([0.002, 0.0, 0.004]))
     assert action.shape == (13,)
     for _ in range(10):
         observation = env.step(action.astype(np.float32))[0]

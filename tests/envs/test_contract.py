@@ -204,7 +204,7 @@ def test_observation_has_no_constant_entry(made):
     steps = 40 // SHORTER.get(env.spec.id, 1)
     observations = np.array([record[0] for seed in (4, 5) for record in rollout(env, seed=seed, steps=steps)])
     constant = np.flatnonzero(np.ptp(observations, axis=0) == 0.0)
-    assert {env.unwrapped.task.entry_name(int(entry)) for entry in constant} <= STILL.get(env.spec.id, set())
+    assert {env.unwrapped.layout.entry_name(int(entry)) for entry in constant} <= STILL.get(env.spec.id, set())
 
 
 def test_channels_make_up_the_observation_in_their_order(made):
@@ -214,7 +214,7 @@ def test_channels_make_up_the_observation_in_their_order(made):
     assert [part.start for part in slices.values()] == ends[:-1] and ends[-1] == env.observation_space.shape[0]
     declared = [channel.name for channel in task.channels]
     assert [name for name in declared if name in slices] == list(slices)
-    assert list(task.action_slices.values())[-1].stop == env.action_space.shape[0]
+    assert list(env.layout.action_slices.values())[-1].stop == env.action_space.shape[0]
     # What was read is what is observed: the tip, where the task observes it.
     observation, info = env.reset(seed=1)
     if "tip_position" in slices:
@@ -247,7 +247,7 @@ def test_documentation_names_every_command_channel_and_reward(made):
 def test_without_force_the_felt_channels_are_zero_and_all_else_is_the_same(made):
     """Observed only: the episode, its rewards and its saved state stay."""
     seeing, blind = made(), made(observe_force=False)
-    felt = seeing.unwrapped.task.force_entries
+    felt = seeing.unwrapped.layout.force_entries
     assert felt
     steps = 12 // SHORTER.get(seeing.spec.id, 1)
     first, second = rollout(seeing, seed=3, steps=steps), rollout(blind, seed=3, steps=steps)
@@ -261,7 +261,7 @@ def test_without_force_the_felt_channels_are_zero_and_all_else_is_the_same(made)
 
 
 def test_lanes_give_what_single_environments_give(made):
-    if not made().unwrapped.task.lanes:
+    if gym.spec(made().spec.id).vector_entry_point is None:
         with pytest.raises(gym.error.Error, match="vector"):
             made(num_envs=2, vectorization_mode="vector_entry_point")
         return

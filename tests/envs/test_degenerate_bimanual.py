@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from surgsim_env.tasks.bimanual_retract import TOUCH_FORCE, BimanualRetractTask
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE
 from surgsim_env.tasks.retract import TURNING_FULL_SCALE
-from surgsim_env.tasks.task import SPEED_FULL_SCALE
 from tests.envs.strategies import Now, mean_return, play
 
 ID = "SurgSim/BimanualRetract-v0"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from surgsim_apps.scoring.episodes import agent_generator, episode_facts
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, reward_weights
 from surgsim_env.tasks.palpate import DECLARE_STEPS, EPISODE_STEPS, PalpateTask
-from surgsim_env.tasks.task import SPEED_FULL_SCALE
 from tests.envs.raster_agent import RasterAgent
 from tests.envs.strategies import Now, mean_return, play
 
@@ -200,4 +200,4 @@ def test_no_degenerate_strategy_is_paid_like_a_plain_search(honest):
         assert mean_return(records) < honest, name
         if not any(record.last["declared"] for record in records):
             # Nor more than an episode in which nothing is done, and nothing is hurt.
-            assert mean_return(records) <= EPISODE_STEPS * PalpateTask.weights["time"] + 1e-9, name
+            assert mean_return(records) <= EPISODE_STEPS * reward_weights(PalpateTask)["time"] + 1e-9, name

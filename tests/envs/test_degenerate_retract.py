@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from surgsim_apps.scoring.expert_retract import RetractExpert
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, reward_weights
 from surgsim_env.tasks.retract import EPISODE_STEPS, SUCCESS_SHARE, RetractTask
-from surgsim_env.tasks.task import SPEED_FULL_SCALE
 from tests.envs.strategies import Now, mean_return, play
 
 ID = "SurgSim/Retract-v0"
@@ -198,7 +198,7 @@ def test_no_degenerate_strategy_is_paid_like_a_plain_script():
     honest = mean_return(play(ID, {"script": script}, seeds)["script"])
     late = {"begin_late": begin_late}
     others = {name: one for name, one in DEGENERATE.items() if name not in late}
-    assert honest > RetractTask.weights["visible"] + RetractTask.weights["grasped"]
+    assert honest > reward_weights(RetractTask)["visible"] + reward_weights(RetractTask)["grasped"]
     paid = play(ID, others, seeds, max_episode_steps=STEPS) | play(ID, late, seeds[:1])
     for name, records in paid.items():
         assert not any(record.last["success"] for record in records), name

@@ -4,10 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_env import CONTACT_FORCE, TIP_POSITION, Channel, PalpateTask, Reward, Task, register_task
+from surgsim_env import CONTACT_FORCE, TIP_POSITION, Channel, PalpateTask, Reward, Setup, Task, register_task
 from surgsim_env.envs.ids import TASKS, environment_class
+from surgsim_env.scene.levels import LESION_GAP
 from surgsim_env.scripting import oracle_script, run_script
-from tests.envs.own_task import load_own_task
+from tests.envs.own_task import IDS, load_own_task, own_task_code
 
 HEIGHT = Channel(
     "height", 2, "m", -0.1, 0.1,
@@ -32,7 +33,7 @@ class Touch(Task):
 
     channels = (TIP_POSITION, CONTACT_FORCE)
     rewards = (Reward("time", -1.0, "step", "each control step"), Reward("success", 1.0, "success", "it was touched"))
-    default_scene = "phantom_small"
+    setup = Setup(scene="phantom_small")
 
     def draw(self, rng):
         point, normal = self.anatomy.face.random_point(rng, 0.01)
@@ -91,8 +92,8 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
     class Gentle(Touch):
         kept = ("place", "steps", "words")
 
-        def __init__(self, anatomy, instrument, *, force=0.05):
-            super().__init__(anatomy, instrument)
+        def __init__(self, scenario, *, force=0.05):
+            super().__init__(scenario)
             self.force = force
 
         def draw(self, rng):
@@ -100,7 +101,7 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
             return super().draw(rng)
 
         def update(self, step):
-            self.steps = [self.steps[0] + 1, 0.5]
+            self.steps = [self.step_count, 0.5]
 
         def end(self, step):
             return super().end(step) or (
@@ -128,12 +129,61 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
         oracle_script(env)
 
 
-def test_the_tutorials_oracle_keeps_the_force():
-    env = gym.make(load_own_task())
-    env.reset(seed=5)
+# ---- the tutorial's tasks ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_the_tutorials_tasks_have_at_most_45_lines(name):
+    assert len(own_task_code(name).splitlines()) <= 45
+
+
+@pytest.mark.parametrize("seed", [1, 5])
+def test_the_tutorials_oracle_holds_the_force_over_the_lesion(seed):
+    env = gym.make(load_own_task("hold_force"))
+    env.reset(seed=seed)
+    inner = env.unwrapped
+    assert inner.task.level.name == "standard" and len(inner.task.lesions) == 1
     trace = run_script(env, oracle_script(env))
-    force = trace.between("follow").force @ env.unwrapped.task.normal
-    assert trace.info["success"] and (np.abs(force - 0.2) < 0.03).all()
+    force = trace.between("AwaitEnd").force
+    assert trace.info["success"] and (np.abs(np.linalg.norm(force, axis=1) - 0.3) < 0.05).all()
+    assert trace.reward.sum() == pytest.approx(6.0)
+
+
+# ---- members and lesions -----------------------------------------------------------------------------------------
+
+
+def test_a_task_has_twelve_public_members():
+    """Class attributes, properties and methods of the base."""
+    assert [name for name in dir(Task) if not name.startswith("_")] == [
+        *("accepts", "channels", "command", "commands", "draw", "end", "info", "kept", "pictured", "rewards", "setup"),
+        "update",
+    ]
+
+
+@pytest.mark.parametrize("level", [None, "hard"])
+@pytest.mark.parametrize(("declared", "counts"), [(2, {2}), ((1, 2), {1, 2})])
+def test_lesions_are_as_many_as_declared(declared, counts, level):
+    setup = Setup(scene="phantom", level=level, lesion_count=declared)
+    env = environment_class(type("Lesions", (Touch,), {"setup": setup}))()
+    task, drawn = env.task, set()
+    for seed in range(8):
+        env.runtime.draw(np.random.default_rng(seed))
+        drawn.add(len(task.lesions))
+        balls = [(np.array(lesion.centre), lesion.radius) for lesion in task.lesions]
+        for number, (centre, radius) in enumerate(balls):
+            for other, other_radius in balls[:number]:
+                assert np.linalg.norm(centre - other) >= radius + other_radius + LESION_GAP
+    assert drawn == counts
+
+
+def test_without_a_level_a_task_draws_lesions_only_if_it_declares_them():
+    plain, levelled = (environment_class(Touch)(**settings) for settings in ({}, {"level": "standard"}))
+    counts = {0: set(), 1: set()}
+    for seed in range(12):
+        for number, env in enumerate((plain, levelled)):
+            env.runtime.draw(np.random.default_rng(seed))
+            counts[number].add(len(env.task.lesions))
+    assert counts[0] == {0} and len(counts[1]) > 1
 
 
 # ---- refusals of a declaration --------------------------------------------------------------------------------------

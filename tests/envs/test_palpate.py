@@ -161,12 +161,12 @@ def test_a_fault_ends_the_episode_with_a_finite_observation_and_a_clean_reset(en
 def test_force_reading_is_noisy_biased_and_flags_saturation(env):
     env.reset(seed=7)
     still = np.array([act(env)[0][6:9] for _ in range(60)])
-    bias = env.task.sensors["contact_force"].bias
+    bias = env.runtime.sensors["contact_force"].bias
     assert (np.abs(bias) <= 0.01).all()
     # Mean of 60 readings: 0.005 / sqrt(60) N each; five of those.
     np.testing.assert_allclose(still.mean(axis=0), bias, atol=5 * 0.005 / np.sqrt(60))
     assert still.std(axis=0) == pytest.approx(0.005, rel=0.4)
-    env.task.sensors["contact_force"].bias = np.array([0.0, 0.0, 3.0])
+    env.runtime.sensors["contact_force"].bias = np.array([0.0, 0.0, 3.0])
     observation, _, _, _, info = act(env)
     assert info["sensor_saturated"] is True
     assert observation[8] == np.float32(2.0)

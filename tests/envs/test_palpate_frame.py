@@ -60,7 +60,7 @@ def test_a_command_moves_the_tip_along_an_axis_of_the_face(liver, axis):
     assert np.abs(np.delete(moved, axis)).max() < 0.1 * moved[axis]
     # The action of a velocity in the world is that of the frame.
     world = liver.task.frame.axes[axis] * 0.01
-    np.testing.assert_allclose(liver.task.action(world)[:3], action[:3], atol=1e-7)
+    np.testing.assert_allclose(liver.layout.action(world)[:3], action[:3], atol=1e-7)
 
 
 def test_a_member_of_a_family_has_its_own_frame():

@@ -14,6 +14,8 @@ from surgsim_env.palpation.site_press import SitePress, press, press_alone, pres
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan
 from surgsim_env.scene.load import make_scene
+from surgsim_env.tasks import palpate_sites
+from surgsim_env.tasks.declaration import reward_weights
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 
 ID = "SurgSim/PalpateSites-v0"
@@ -123,7 +125,7 @@ def test_healthy_tissue_of_nominal_modulus_has_contrast_one(monkeypatch):
     env.reset(seed=0)
     task = env.task
     healthy = DrawnOrgan((), 1.0, 0.0)
-    monkeypatch.setattr(type(task.level), "draw", lambda *_: healthy)
+    monkeypatch.setattr(type(task.level), "draw", lambda *_, **__: healthy)
     task.reading.sensor = replace(task.reading.sensor, noise=0.0, bias=0.0)
     records = play(env, 1, np.random.default_rng(2).uniform(-1.0, 1.0, (6, 2)).astype(np.float32))
     np.testing.assert_allclose([np.log(record[-1]["contrast"]) for record in records], 0.0, atol=0.03)
@@ -200,7 +202,7 @@ def test_what_is_found_pays_by_its_change():
 
 def test_harm_never_pays():
     """The reckoning that stands beside the weights, for every number of presses made of the budget."""
-    weights = PalpateSitesTask.weights
+    weights = reward_weights(PalpateSitesTask)
     assert weights["forgone"] == weights["error"] + weights["soft_force"]
     for done in np.linspace(0.0, 1.0, 11):
         for found_first in (0.0, 1.0):
@@ -222,12 +224,11 @@ def test_a_fault_ends_the_episode_with_the_last_finite_observation():
     assert reward < -3.0
 
 
-def test_the_budget_of_a_wide_scene_is_larger():
-    level, scene = LEVELS["standard"], make_scene("phantom_wide")
+def test_the_budget_of_a_wide_scene_is_larger(monkeypatch):
     flat = healthy_module.HealthyMap(np.full((25, 25), 55.0))
-    task = PalpateSitesTask(load_anatomy(level.scene(scene)), level, flat)
-    assert task.budget == 60
-    assert PalpateSitesTask(load_anatomy(level.scene(scene)), level, flat, budget=7).budget == 7
+    monkeypatch.setattr(palpate_sites, "healthy_map_of", lambda _: flat)
+    assert gym.make(ID, scene="phantom_wide").unwrapped.task.budget == 60
+    assert gym.make(ID, scene="phantom_wide", budget=7).unwrapped.task.budget == 7
 
 
 # ---- many side by side ----------------------------------------------------------------------------------------------
@@ -239,7 +240,7 @@ def test_a_press_that_was_begun_is_forgotten_with_its_episode():
     saved = env.save_state()
     expected = env.step(MIDDLE)
     for forget in (lambda: env.reset(seed=9), lambda: env.load_state(saved)):
-        env.begin_press(np.ones(2, dtype=np.float32))
+        env.begin(np.ones(2))
         forget()
         found = env.step(MIDDLE)
         np.testing.assert_array_equal(found[0], expected[0])

@@ -22,9 +22,9 @@ def test_the_observation_is_what_its_table_says(retract_env):
     axes = observation[6:12].reshape(2, 3)
     np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-6)
     assert observation[12] == pytest.approx(retract_env.simulation.instrument.jaw.opening, abs=1e-6)
-    bias = retract_env.task.sensors["contact_force"].bias
+    bias = retract_env.runtime.sensors["contact_force"].bias
     np.testing.assert_allclose(observation[13:16], bias, atol=6 * retract_env.scene.sensor.noise)
-    np.testing.assert_array_equal(observation[13:16], retract_env.task.sensed_force(observation).astype(np.float32))
+    np.testing.assert_array_equal(observation[13:16], retract_env.layout.sensed_force(observation).astype(np.float32))
     np.testing.assert_array_equal(observation[19:22], 0.0)
     nodes = retract_env.simulation.organ_state.node_position[retract_env.task.tracked_nodes]
     np.testing.assert_allclose(observation[22:52].reshape(-1, 3), nodes, atol=1e-7)
@@ -34,11 +34,11 @@ def test_the_observation_is_what_its_table_says(retract_env):
 
 def test_an_action_is_read_as_it_was_made(retract_env):
     velocity, turning = np.array([0.004, -0.008, 0.012]), np.array([0.2])
-    action = retract_env.task.action(velocity, turning=turning, jaw=0.3)
+    action = retract_env.layout.action(velocity, turning=turning, jaw=0.3)
     np.testing.assert_allclose(action, [0.2, -0.4, 0.6, 0.4, 0.3])
     # What is not said stays: the jaw's last target, and no turning.
     act(retract_env, jaw=0.3)
-    np.testing.assert_allclose(retract_env.task.action(np.zeros(3)), [0.0, 0.0, 0.0, 0.0, 0.3])
+    np.testing.assert_allclose(retract_env.layout.action(np.zeros(3)), [0.0, 0.0, 0.0, 0.0, 0.3])
 
 
 def test_wrist_turns_at_the_commanded_rate(retract_env):

@@ -5,26 +5,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, ControlStep, reward_weights
 from surgsim_env.tasks.retract import EPISODE_STEPS, HIDDEN_SHARE, SUCCESS_SHARE, RetractTask
-from surgsim_env.tasks.task import SPEED_FULL_SCALE
 from tests.envs.retract_steps import EMPTY, HELD, STEP, act
+
+WEIGHTS = reward_weights(RetractTask)
 
 
 class Told:
     """A task's verdicts on what it is told was seen and grasped; nothing moves."""
 
     def __init__(self, env, monkeypatch):
-        self.task, self.simulation = env.task, env.simulation
+        self.task, self.runtime, self.simulation = env.task, env.runtime, env.simulation
         self.returned, self.verdict = 0.0, None
+        monkeypatch.setattr(self.task, "_look", lambda _: self.visible)
         monkeypatch.setattr(type(self.simulation), "grasp", property(lambda _: HELD if self.holds else EMPTY))
         self.holds = False
 
     def step(self, visible=0.0, holds=False, force=0.0, pull=0.0, fault=""):
-        self.holds, self.simulation.pull_peak = holds, pull
-        self.task.begin(np.zeros(self.task.action_size))
+        self.visible, self.holds, self.simulation.pull_peak = visible, holds, pull
+        self.task.step_count += 1
+        step = ControlStep(self.simulation, force, fault)
         if not fault:
-            self.task.visible_share = visible
-        self.verdict = self.task.judge(self.simulation, force, fault)
+            self.task.update(step)
+        self.verdict = self.runtime.judge(step)
         self.returned += sum(self.verdict.rewards.values())
         return self.verdict
 
@@ -39,7 +43,7 @@ def told(retract_env, monkeypatch):
 
 def test_the_weights_put_every_failure_below_every_full_episode():
     """The inequality of the table's comment."""
-    w = RetractTask.weights
+    w = WEIGHTS
     assert w["forgone"] == pytest.approx(w["time"] + w["soft_force"])
     for failure in ("torn", "hard_force", "fault"):
         margin = -HIDDEN_SHARE * w["visible"] + EPISODE_STEPS * w["soft_force"] - w["visible"] - w["grasped"]
@@ -51,9 +55,9 @@ FAILURES = {"torn": {"pull": 1e9}, "hard_force": {"force": 1e9}, "fault": {"faul
 
 def worst_full_return(told):
     """A full episode that presses as hard as it may all the time and loses at its end what was seen at its start."""
-    told.task._reached = {"visible": HIDDEN_SHARE, "grasped": 0.0}
+    told.runtime._reached = {"visible": HIDDEN_SHARE, "grasped": 0.0}
     for _ in range(EPISODE_STEPS):
-        verdict = told.step(force=told.task.force_limit)
+        verdict = told.step(force=told.runtime.force_limit)
     assert verdict.truncated and not verdict.terminated
     return told.returned
 
@@ -64,14 +68,14 @@ def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
     """The best way to fail: all seen but never for long, grasped, without pressing; then, sooner or later, harm."""
     worst = worst_full_return(told)
     for step in (1, 2, 9, 100, 333, 599, 600):
-        told.task.reset(np.random.default_rng(0))
-        told.task._reached = {"visible": 0.0, "grasped": 0.0}
+        told.runtime.draw(np.random.default_rng(0))
+        told.runtime._reached = {"visible": 0.0, "grasped": 0.0}
         told.returned = 0.0
         for before in range(1, step):
             # Never for SUCCESS_TIME on end.
             assert not told.step(visible=float(before % 10 > 0), holds=True).terminated
         verdict = told.step(visible=1.0, holds=True, **FAILURES[failure])
-        assert verdict.terminated and verdict.rewards[failure] == RetractTask.weights[failure]
+        assert verdict.terminated and verdict.rewards[failure] == WEIGHTS[failure]
         assert told.returned < worst
 
 
@@ -79,10 +83,10 @@ def test_seen_and_grasped_pay_once_however_often_they_come_and_go(told):
     for _ in range(40):
         told.step(visible=0.7, holds=True)
         told.step(visible=0.1, holds=False)
-    assert told.returned == pytest.approx(80 * RetractTask.weights["time"] + 0.1 * RetractTask.weights["visible"])
+    assert told.returned == pytest.approx(80 * WEIGHTS["time"] + 0.1 * WEIGHTS["visible"])
     told.step(visible=0.7, holds=True)
-    assert told.verdict.rewards["visible"] == pytest.approx(0.6 * RetractTask.weights["visible"])
-    assert told.verdict.rewards["grasped"] == RetractTask.weights["grasped"]
+    assert told.verdict.rewards["visible"] == pytest.approx(0.6 * WEIGHTS["visible"])
+    assert told.verdict.rewards["grasped"] == WEIGHTS["grasped"]
 
 
 def test_success_is_a_half_second_on_end(told):
@@ -101,14 +105,14 @@ def test_soft_force_costs_by_its_share_of_the_way_to_the_hard_limit(told):
     limits = told.task.limits
     middle = 0.5 * (limits.soft_force + limits.hard_force)
     for force, share in ((limits.soft_force, 0.0), (middle, 0.5), (limits.hard_force, 1.0)):
-        assert told.step(force=force).rewards["soft_force"] == pytest.approx(share * RetractTask.weights["soft_force"])
+        assert told.step(force=force).rewards["soft_force"] == pytest.approx(share * WEIGHTS["soft_force"])
 
 
 def test_time_runs_out_after_600_steps(told):
     for step in range(1, EPISODE_STEPS + 1):
         verdict = told.step()
         assert verdict.truncated == (step == EPISODE_STEPS)
-    assert told.returned == pytest.approx(EPISODE_STEPS * RetractTask.weights["time"], abs=0.5)
+    assert told.returned == pytest.approx(EPISODE_STEPS * WEIGHTS["time"], abs=0.5)
 
 
 # ---- what ends it -----------------------------------------------------------------------------------------------
@@ -125,7 +129,7 @@ def test_a_step_that_tears_ends_in_its_very_haptic_step(shared_retract):
     finally:
         task.limits = limits
     assert info["torn"] and not info["hard_limit"] and not info["success"]
-    assert info["reward_torn"] == RetractTask.weights["torn"]
+    assert info["reward_torn"] == WEIGHTS["torn"]
     assert 0.08 < info["pull_force_peak"] < 0.085
     steps = shared_retract.simulation.time / STEP
     assert abs(steps - round(steps)) > 0.01
@@ -166,5 +170,5 @@ def test_a_fault_ends_it_with_the_last_finite_observation_and_a_clean_reset(retr
     observation, reward, terminated, _, info = act(retract_env)
     assert terminated and "no longer finite" in info["sim_fault"]
     np.testing.assert_array_equal(observation, before)
-    assert reward < RetractTask.weights["fault"] + 598 * RetractTask.weights["forgone"] + 1e-9
+    assert reward < WEIGHTS["fault"] + 598 * WEIGHTS["forgone"] + 1e-9
     np.testing.assert_array_equal(retract_env.reset(seed=6)[0], expected)

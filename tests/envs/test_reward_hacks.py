@@ -13,16 +13,17 @@ import pytest
 import surgsim_env
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
-from surgsim_env.tasks.declaration import PERIODS
+from surgsim_env.tasks.declaration import PERIODS, reward_weights
 from surgsim_env.tasks.palpate import EPISODE_STEPS, PalpateTask
 from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, PalpateSitesTask
 from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks.task import Scenario
 
 # The declared terms by what they are paid for, and the number of control steps. Those per step lie in [0, 1]; where
 # `shared`, they and `forgone` are shares of the budget. Changes are of a number in [0, 1] and telescope.
 TABLES = {
     f"{task.__name__} {steps}": {
-        "weights": task.weights,
+        "weights": reward_weights(task),
         "steps": steps,
         "shared": task is PalpateSitesTask,
         **{per: tuple(one.name for one in task.rewards if one.per == per) for per in PERIODS},
@@ -88,7 +89,7 @@ def test_declaring_at_the_likeliest_place_pays_less_than_a_search_that_finds(sce
 
     A gentle search that finds in its last step returns found + 600 time.
     """
-    weights = PalpateTask.weights
+    weights = reward_weights(PalpateTask)
     right = blind_share(scene)
     missed = weights["wrong"] + EPISODE_STEPS * weights["forgone"]
     blind = right * weights["found"] + (1.0 - right) * missed
@@ -99,7 +100,7 @@ def test_declaring_at_the_likeliest_place_pays_less_than_a_search_that_finds(sce
 def blind_share(scene):
     """The largest share of drawn lesions that one place on the face is within the success distance of."""
     anatomy, rng = load_anatomy(surgsim_env.make_scene(scene)), np.random.default_rng(0)
-    distance = PalpateTask(anatomy).success_distance
+    distance = PalpateTask(Scenario(anatomy)).success_distance
     places = np.array([anatomy.face.project(anatomy.random_lesion(rng).centre)[0] for _ in range(150)])
     tried = [places.mean(axis=0), *places[:40]]
     tried = [anatomy.face.project(place)[0] for place in tried]
@@ -120,7 +121,7 @@ def test_a_fault_is_paid_less_than_an_episode_in_which_nothing_is_found(env_id):
     env.simulation.organ_state.node_velocity[100, 1] = np.nan
     _, reward, over, _, info = env.step(rest)
     assert over and info["sim_fault"]
-    assert total + reward < EPISODE_STEPS * env.task.weights["time"]
+    assert total + reward < EPISODE_STEPS * reward_weights(env.task)["time"]
 
 
 # ---- press by press ---------------------------------------------------------------------------------------------
@@ -133,7 +134,7 @@ def presses():
 
 @pytest.mark.slow
 def test_a_press_that_ends_in_harm_is_paid_less_than_the_worst_episode(presses, monkeypatch):
-    weights = PalpateSitesTask.weights
+    weights = reward_weights(PalpateSitesTask)
     # What `found` begins with is lost at most.
     worst = weights["error"] + weights["soft_force"] - weights["found"]
     presses.reset(seed=SEED)

@@ -93,10 +93,15 @@ def test_an_environment_that_was_never_reset_is_loaded_or_stays_so(palpate, save
 
 def test_a_press_that_was_begun_outlives_a_refusal():
     env = played(SITES, steps=0, budget=5, **SMALL)
-    press = env.begin_press(np.full(2, 0.3))
+    other = played(SITES, steps=0, budget=5, **SMALL)
+    action = np.full(2, 0.3)
+    env.begin(action)
     with pytest.raises(ValueError, match="not a saved state"):
         env.load_state(b"")
-    assert env._made is not None and env._made[1] is press
+    env.advance([env])
+    found, expected = env.finish(), other.step(action)
+    np.testing.assert_array_equal(found[0], expected[0])
+    assert found[1:] == expected[1:]
 
 
 def test_the_state_of_a_fault_is_loaded_although_it_is_not_finite():

@@ -1,11 +1,15 @@
 """Environments side by side give what each would give alone: held against gymnasium's SyncVectorEnv, to the bit."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
+from surgsim_env.coupling import exchange, simulation
 from surgsim_env.envs.ids import PalpateEnv
+from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.envs.vector_env import vector_class
 
 ID = "SurgSim/Palpate-v0"
@@ -174,16 +178,67 @@ def test_threads_and_the_number_of_environments_change_nothing():
     np.testing.assert_array_equal(runs[0], runs[2])
 
 
-def test_a_bad_action_is_refused_before_anything_moves():
+def test_a_bad_action_is_refused_before_any_lane_is_commanded():
+    """The message has the lane and its way out; what is saved, commands of the other lanes included, is as before."""
     envs = side_by_side()
     envs.reset(seed=0)
-    simulations = [env.unwrapped.simulation for env in envs.envs]
-    before = [(one.instrument.tip_position, one.organ_state.node_position.copy()) for one in simulations]
-    bad = np.zeros((COUNT, 4), dtype=np.float32)
+    before = [env.save_state() for env in envs.envs]
+    bad = np.full((COUNT, 4), 0.5, dtype=np.float32)
     bad[2, 1] = 1.5
-    with pytest.raises(ValueError, match=r"action\[1\] is 1\.5"):
+    with pytest.raises(ValueError, match=r"lane 2: action\[1\] is 1\.5.*gymnasium\.wrappers\.vector\.ClipAction"):
         envs.step(bad)
-    for one, (tip, nodes) in zip(simulations, before, strict=True):
-        assert one.time == 0.0
-        np.testing.assert_array_equal(one.instrument.tip_position, tip)
-        np.testing.assert_array_equal(one.organ_state.node_position, nodes)
+    with pytest.raises(ValueError, match=r"actions have shape \(2, 4\); the rule is \(3, 4\)"):
+        envs.step(bad[:2])
+    assert [env.save_state() for env in envs.envs] == before
+    gym.wrappers.vector.ClipAction(envs).step(bad)
+
+
+def test_an_ended_episode_is_refused_in_mode_disabled():
+    envs = side_by_side(autoreset_mode="Disabled", max_episode_steps=1)
+    envs.reset(seed=0)
+    still = np.zeros((COUNT, 4), dtype=np.float32)
+    assert envs.step(still)[3].all()
+    with pytest.raises(gym.error.ResetNeeded, match="lane 0: the episode is over: reset it with options="):
+        envs.step(still)
+    envs.reset(options={"reset_mask": np.array([True, False, False])})
+    with pytest.raises(gym.error.ResetNeeded, match="lane 1: the episode is over"):
+        envs.step(still)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"seed": [1, 2]}, "2 seeds are given for 3 environments"),
+        (
+            {"options": {"reset_mask": np.ones(2, dtype=np.bool_)}},
+            r"reset_mask is bool \(2,\); the rule is bool \(3,\)",
+        ),
+        ({"options": {"reset_mask": np.ones(3)}}, r"reset_mask is float64 \(3,\)"),
+        ({"options": {"other": 1}}, "reset option 'other' is unknown"),
+    ],
+)
+def test_a_reset_that_does_not_fit_is_refused(given: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        side_by_side().reset(**given)
+
+
+def test_compiled_code_is_three_calls_below_step(monkeypatch: pytest.MonkeyPatch):
+    """Python frames from `step`, itself included, to the call of the compiled loop."""
+    counts = []
+
+    def haptic_loop(*, compiled: bool):
+        def advance(*arguments):
+            frame, count = sys._getframe(1), 1
+            while frame.f_code is not SurgicalEnv.step.__code__:
+                frame, count = frame.f_back, count + 1
+            counts.append(count)
+            return loop(*arguments)
+
+        loop = exchange.haptic_loop(compiled=compiled)
+        return advance
+
+    monkeypatch.setattr(simulation, "haptic_loop", haptic_loop)
+    env = PalpateEnv(scene="phantom_small")
+    env.reset(seed=0)
+    env.step(DOWN)
+    assert counts == [3]

@@ -10,7 +10,7 @@ def walk(env, rng):
         if "Retract" in env.spec.id:
             action[1] = 0.4 * action[1] - 0.8  # towards the free edge
             # The jaw nearly closed, so that it does not pass above and below the lobe.
-            action[env.unwrapped.task.jaw_place] -= 0.5
+            action[env.unwrapped.layout.action_slices["jaw"].start] -= 0.5
         elif "TracePath" in env.spec.id:
             action *= (0.2, 0.2, 1.0)  # near the line
             action[2] -= 0.2

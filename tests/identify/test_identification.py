@@ -27,9 +27,9 @@ KNOWN = IdentifyOptions(thickness=0.012)
 @pytest.fixture(autouse=True)
 def closed_model(monkeypatch):
     monkeypatch.setattr(shape_search, "press_block", closed_press)
-    # The stand-in has one number of shape: fewer looks find it.
-    monkeypatch.setattr(shape_search, "LOOKED_AT", 192)
-    monkeypatch.setattr(shape_search, "PROFILE_LOOKS", 32)
+    # The stand-in has one number of shape: fewer candidates find it.
+    monkeypatch.setattr(shape_search, "CANDIDATES", 192)
+    monkeypatch.setattr(shape_search, "PROFILE_CANDIDATES", 32)
 
 
 def tissue(depth):
@@ -46,41 +46,41 @@ def stiffening_set():
 
 
 def test_stiffening_tissue_is_described_and_linear_tissue_is_worse(stiffening_set):
-    found = identify([stiffening_set], KNOWN)
-    (one,) = found.sets
-    assert not found.is_linear
-    assert int(one.is_training.sum()) == 12 and len(one.fits.samples) == 24
+    result = identify([stiffening_set], KNOWN)
+    (dataset,) = result.sets
+    assert not result.is_linear
+    assert int(dataset.is_training.sum()) == 12 and len(dataset.fits.samples) == 24
     # 1 % of noise has a median size of 0.67 %.
-    assert one.error.median < 0.012 < 0.05 < one.linear_error.median
-    assert one.error.high < 0.025
-    assert np.median(one.fits.modulus / truth()[0]) == pytest.approx(1.0, abs=0.1)
+    assert dataset.error.median < 0.012 < 0.05 < dataset.linear_error.median
+    assert dataset.error.high < 0.025
+    assert np.median(dataset.fits.modulus / truth()[0]) == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_interval_holds_the_truth_and_what_is_not_told_is_said(stiffening_set):
-    """The made tissue depends on growth = log(cap) / (onset + cap strain) alone, so that no single one is told."""
-    found = identify([stiffening_set], KNOWN)
-    intervals = found.found.intervals
+def test_the_interval_holds_the_truth_and_a_parameter_that_is_not_identifiable_is_named(stiffening_set):
+    """The made tissue depends on growth = log(cap) / (onset + cap strain) alone: no parameter is identifiable."""
+    result = identify([stiffening_set], KNOWN)
+    intervals = result.best.intervals
     assert set(intervals) == {"onset_strain", "cap_strain", "tangent_cap"}
     for name in intervals:
         assert intervals[name].low <= getattr(LAW, name) <= intervals[name].high, name
         assert intervals[name].low <= intervals[name].value <= intervals[name].high
-    assert not intervals["tangent_cap"].told
-    assert any("tangent_cap is not told" in line for line in found.warnings)
-    assert sum("poisson_ratio is given, not fitted" in line for line in found.warnings) == 2
+    assert not intervals["tangent_cap"].is_identifiable
+    assert any("tangent_cap is not identifiable" in line for line in result.warnings)
+    assert sum("poisson_ratio is given, not fitted" in line for line in result.warnings) == 2
 
 
 def test_linear_tissue_gets_no_stiffening():
-    found = identify([recording(silicone, noise=0.01)], KNOWN)
-    assert found.is_linear and found.shape.tangent_cap == 1.0
-    assert any("stiffening is not told" in line for line in found.warnings)
-    assert found.sets[0].error == found.sets[0].linear_error
+    result = identify([recording(silicone, noise=0.01)], KNOWN)
+    assert result.is_linear and result.shape.tangent_cap == 1.0
+    assert any("stiffening is not identifiable" in line for line in result.warnings)
+    assert result.sets[0].error == result.sets[0].linear_error
 
 
 def test_an_unknown_thickness_is_searched_with_a_warning(stiffening_set):
-    found = identify([stiffening_set])
-    assert found.sets[0].error.median < 0.015
-    assert "thickness" in found.found.intervals
-    assert any("thickness" in line and "give --thickness" in line for line in found.warnings)
+    result = identify([stiffening_set])
+    assert result.sets[0].error.median < 0.015
+    assert "thickness" in result.best.intervals
+    assert any("thickness" in line and "give --thickness" in line for line in result.warnings)
 
 
 @pytest.mark.slow
@@ -88,8 +88,8 @@ def test_two_sets_share_the_law_and_a_seed_repeats(stiffening_set):
     other = recording(tissue, noise=0.01, seed=5, name="other")
     first = identify([stiffening_set, other], KNOWN)
     again = identify([stiffening_set, other], KNOWN)
-    assert [one.recording.name for one in first.sets] == ["made", "other"]
-    assert all(one.error.median < 0.015 for one in first.sets)
+    assert [dataset.recording.name for dataset in first.sets] == ["made", "other"]
+    assert all(dataset.error.median < 0.015 for dataset in first.sets)
     assert first.shape == again.shape
     np.testing.assert_array_equal(first.moduli, again.moduli)
     swapped = identify([stiffening_set], replace(KNOWN, seed=1))
@@ -98,22 +98,22 @@ def test_two_sets_share_the_law_and_a_seed_repeats(stiffening_set):
 
 def test_the_held_out_half_does_not_choose_the_law(stiffening_set):
     """Spoilt forces of held-out sites change their error, and neither the law nor the moduli of the others."""
-    found = identify([stiffening_set], KNOWN)
-    training = found.sets[0].is_training
+    result = identify([stiffening_set], KNOWN)
+    training = result.sets[0].is_training
     presses = tuple(
         press if training[row] else replace(press, force=press.force * np.linspace(1.0, 2.0, 10))
         for row, press in enumerate(stiffening_set.presses)
     )
     spoilt = identify([Recording("spoilt", presses)], KNOWN)
-    assert spoilt.shape == found.shape
-    np.testing.assert_array_equal(spoilt.sets[0].fits.modulus[training], found.sets[0].fits.modulus[training])
-    assert spoilt.sets[0].error.median > found.sets[0].error.median
+    assert spoilt.shape == result.shape
+    np.testing.assert_array_equal(spoilt.sets[0].fits.modulus[training], result.sets[0].fits.modulus[training])
+    assert spoilt.sets[0].error.median > result.sets[0].error.median
 
 
-def test_bad_sites_are_told(stiffening_set):
+def test_bad_sites_are_named(stiffening_set):
     flat = SitePress(77, np.zeros(3), stiffening_set.presses[0].depth, np.full(10, 0.1))
-    found = identify([Recording("some", (*stiffening_set.presses, flat))], KNOWN)
-    assert any("some" in line and "77" in line for line in found.warnings)
+    result = identify([Recording("some", (*stiffening_set.presses, flat))], KNOWN)
+    assert any("some" in line and "77" in line for line in result.warnings)
     with pytest.raises(ValueError, match="few: 5 of 6 sites"):
         identify([Recording("few", (*stiffening_set.presses[:5], flat))], KNOWN)
 
@@ -122,13 +122,13 @@ def test_held_presses_give_arms_and_the_law_at_equilibrium(monkeypatch):
     arms = Arms((0.3, 0.5), (0.5, 6.0))
     # The stand-in does not know springs from the volume term.
     monkeypatch.setattr(identification, "_of_springs", lambda library, shape, curve, relaxation: relaxation)
-    made = recording(tissue, count=16, samples=40, time=TIME, arms=arms, noise=0.005)
-    found = identify([made], KNOWN)
-    assert found.relaxation is not None
-    assert found.relaxation.relative_moduli == pytest.approx(arms.moduli, rel=0.15)
-    assert found.relaxation.times == pytest.approx(arms.times, rel=0.2)
-    assert found.relaxation.error < 0.01 < found.relaxation.elastic_error
-    assert found.sets[0].error.median < 0.015
+    held = recording(tissue, count=16, samples=40, time=TIME, arms=arms, noise=0.005)
+    result = identify([held], KNOWN)
+    assert result.relaxation is not None
+    assert result.relaxation.relative_moduli == pytest.approx(arms.moduli, rel=0.15)
+    assert result.relaxation.times == pytest.approx(arms.times, rel=0.2)
+    assert result.relaxation.error < 0.01 < result.relaxation.elastic_error
+    assert result.sets[0].error.median < 0.015
 
 
 @pytest.fixture
@@ -140,9 +140,9 @@ def run(tmp_path, stiffening_set, capsys):
 
 
 def test_the_command_writes_a_set_of_results(run):
-    folder, said = run
+    folder, printed = run
     assert {path.name for path in folder.iterdir()} == set(RESULT_NAMES)
-    assert "tangent_cap" in said and "note: poisson_ratio is given" in " ".join(said.split())
+    assert "tangent_cap" in printed and "note: poisson_ratio is given" in " ".join(printed.split())
     for name in ("curves.png", "modulus_map.png"):
         picture = imread(folder / name)
         assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50

@@ -120,12 +120,12 @@ def test_tissue_made_by_the_organ_on_another_mesh_is_identified():
     """A law that the command does not know, on cells of 1.3 mm, with 1 % of noise; thickness given."""
     curve = press_block(LAW, PressSetting(depth=4.2e-3), cells_to_radius=5)
     made = recording(lambda depth: curve.at(depth), noise=0.01)
-    found = identify([Recording("made", made.presses)], IdentifyOptions(thickness=0.012))
-    (one,) = found.sets
-    assert not found.is_linear
-    assert one.error.median < 0.02 < 0.06 < one.linear_error.median
-    assert np.median(one.fits.modulus / truth()[0]) == pytest.approx(1.0, abs=0.1)
-    # What is told is the tension in the strains under the ball, whatever numbers describe it.
+    result = identify([Recording("made", made.presses)], IdentifyOptions(thickness=0.012))
+    (dataset,) = result.sets
+    assert not result.is_linear
+    assert dataset.error.median < 0.02 < 0.06 < dataset.linear_error.median
+    assert np.median(dataset.fits.modulus / truth()[0]) == pytest.approx(1.0, abs=0.1)
+    # The tension in the strains under the ball is identifiable, its numbers are not.
     strains = np.array([0.05, 0.1, 0.15, 0.2, 0.25])
-    material, wanted = (shape.material(1e3, 0.45).stiffening for shape in (found.shape, LAW))
+    material, wanted = (shape.material(1e3, 0.45).stiffening for shape in (result.shape, LAW))
     np.testing.assert_allclose(material.tension(strains), wanted.tension(strains), rtol=0.25)

@@ -112,7 +112,7 @@ def test_the_tip_of_the_psm_keeps_its_direction():
         instrument.command_velocity(np.array([0.014, -0.014, 0.0]))
         for _ in let_run(instrument, 50):
             pass
-    assert instrument.arm.tip_direction(instrument.joint_positions) == pytest.approx(DOWN, abs=2e-3)
+    assert instrument.arm.tip_direction(instrument.steered.joint_positions) == pytest.approx(DOWN, abs=2e-3)
 
 
 def test_the_tip_turns_at_the_rate_it_is_told():
@@ -128,7 +128,7 @@ def test_the_tip_turns_at_the_rate_it_is_told():
         pass
     assert instrument.tip_position == pytest.approx(ABOVE, abs=5e-5)
     expected = np.array([-np.sin(0.4), 0.0, -np.cos(0.4)])
-    assert instrument.arm.tip_direction(instrument.joint_positions) == pytest.approx(expected, abs=1e-3)
+    assert instrument.arm.tip_direction(instrument.steered.joint_positions) == pytest.approx(expected, abs=1e-3)
 
 
 def test_it_presses_and_holds_still(simulation):
@@ -154,10 +154,10 @@ def test_a_press_of_the_scan_feels_what_the_probe_feels(name):
     for instrument in ("probe", name):
         anatomy = phantom(instrument)
         simulation = Simulation(anatomy)
-        found = press(simulation, np.array([0.025, 0.03, 0.03]), np.array([0.0, 0.0, 1.0]))
-        assert not found.end
-        forces.append(found.force)
-        depths.append(found.depth)
+        result = press(simulation, np.array([0.025, 0.03, 0.03]), np.array([0.0, 0.0, 1.0]))
+        assert not result.end
+        forces.append(result.force)
+        depths.append(result.depth)
     assert depths[1] == pytest.approx(depths[0], abs=1e-4)
     assert forces[1] == pytest.approx(forces[0], rel=0.04)
 
@@ -184,10 +184,10 @@ def test_gravity_is_compensated(instrument):
     instrument.place(ABOVE)
     assert np.linalg.norm(instrument.model.opt.gravity) == pytest.approx(9.81)
     assert np.abs(instrument.data.qacc).max() < 1e-9
-    before = instrument.joint_positions.copy()
+    before = instrument.steered.joint_positions.copy()
     for _ in let_run(instrument, 200):
         pass
-    assert np.abs(instrument.joint_positions - before).max() < 1e-9
+    assert np.abs(instrument.steered.joint_positions - before).max() < 1e-9
 
 
 def test_the_box_stops_the_tip_and_says_so(instrument):
@@ -216,7 +216,7 @@ def test_a_joints_limit_stops_the_tip_and_says_so():
             pass
     assert instrument.workspace_limited
     arm = instrument.arm
-    insertion = instrument.joint_positions[arm.joints.index("insertion")]
+    insertion = instrument.steered.joint_positions[arm.joints.index("insertion")]
     assert 0.238 < insertion < 0.2401
     assert instrument.tip_position[:2] == pytest.approx(ABOVE[:2], abs=1e-5)
 

@@ -34,28 +34,28 @@ def test_poses_within_the_limits_are_found(psm):
         joints[2] = max(joints[2], 0.05)
         pose = psm.tip_pose(joints)
         for wanted in ({}, {"direction": psm.tip_direction(joints)}, {"rotation": pose.rotation}):
-            found = reach_pose(psm, pose.position, **wanted)
-            assert found.reached, (joints, wanted)
-            assert np.linalg.norm(psm.tip_pose(found.joints).position - pose.position) < 1e-8
-            assert ((found.joints >= psm.lower) & (found.joints <= psm.upper)).all()
+            solution = reach_pose(psm, pose.position, **wanted)
+            assert solution.reached, (joints, wanted)
+            assert np.linalg.norm(psm.tip_pose(solution.joints).position - pose.position) < 1e-8
+            assert ((solution.joints >= psm.lower) & (solution.joints <= psm.upper)).all()
             if "rotation" in wanted:
-                assert np.abs(psm.tip_pose(found.joints).rotation - pose.rotation).max() < 1e-5
+                assert np.abs(psm.tip_pose(solution.joints).rotation - pose.rotation).max() < 1e-5
 
 
 def test_what_is_out_of_reach_is_told_with_its_distance(psm):
     """The insertion ends at 0.24 m: straight down, 0.4 m is the rest too far."""
     longest = psm.tip_pose([0.0, 0.0, 0.24, 0.0, 0.0, 0.0]).position
-    found = solve_pose(psm, [0.0, 0.0, -0.4])
-    assert not found.reached
-    assert found.position_error == pytest.approx(0.4 + longest[2], abs=1e-4)
+    solution = solve_pose(psm, [0.0, 0.0, -0.4])
+    assert not solution.reached
+    assert solution.position_error == pytest.approx(0.4 + longest[2], abs=1e-4)
 
 
 def test_a_pose_far_from_the_start_is_found_through_the_trocar(six_axis):
     trocar = np.array(six_axis.port.point)
     for offset in ([0.03, 0.02, -0.10], [-0.05, 0.0, -0.08], [0.0, -0.06, -0.12]):
-        found = solve_pose(six_axis, trocar + offset)
-        assert found.reached, found
-        assert six_axis.trocar_residual(found.joints) < 1e-9
+        solution = solve_pose(six_axis, trocar + offset)
+        assert solution.reached, solution
+        assert six_axis.trocar_residual(solution.joints) < 1e-9
 
 
 def test_a_held_joint_leaves_its_share_to_the_others():

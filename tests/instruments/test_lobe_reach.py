@@ -45,8 +45,8 @@ def pair() -> Pair:
 def test_each_arm_reaches_its_work_as_it_shall_point(pair: Pair, side: str, places):
     """The left jaw level at the edge and folded back, the right tip level on the bed below: within a micrometre."""
     for place in places:
-        found = pair.arms[side].reach(np.array(place))
-        assert found.position_error < 1e-6 and found.angle_error < 1e-3, place
+        solution = pair.arms[side].reach(np.array(place))
+        assert solution.position_error < 1e-6 and solution.angle_error < 1e-3, place
 
 
 def test_the_arms_are_apart_where_they_work(pair: Pair):
@@ -59,40 +59,40 @@ def test_the_arms_are_apart_where_they_work(pair: Pair):
 @pytest.mark.parametrize(("model", "force"), [("grasper.xml", 0.5), ("psm_retractor", 0.4)])
 def test_a_jaw_gets_around_the_edge_that_stands_over(model: str, force: float):
     """Open, level, one pad above and one below the edge of the lobe at rest: nothing touches anything."""
-    one = Simulation(lobe(model, port=LEFT_PORT))
-    edge = one.organ_state.node_position[one.organ_model.node_rest_position[:, 1] > 0.0519]
-    one.restart(np.array([0.04, 0.049, edge[:, 2].mean()]))
-    one.control_step(50)
-    assert one.end_control_step(), one.fault
-    assert not one.contact_wrench.any() and one.instrument.data.ncon == 0
-    one.instrument.command_jaw(-1.0)
+    sim = Simulation(lobe(model, port=LEFT_PORT))
+    edge = sim.organ_state.node_position[sim.organ_model.node_rest_position[:, 1] > 0.0519]
+    sim.restart(np.array([0.04, 0.049, edge[:, 2].mean()]))
+    sim.control_step(50)
+    assert sim.end_control_step(), sim.fault
+    assert not sim.contact_wrench.any() and sim.instrument.data.ncon == 0
+    sim.instrument.command_jaw(-1.0)
     for _ in range(14):
-        one.control_step(50)
-        assert one.end_control_step(), one.fault
-    assert one.grasp.holds and one.grasp.grip_force == pytest.approx(force, rel=0.2)
+        sim.control_step(50)
+        assert sim.end_control_step(), sim.fault
+    assert sim.grasp.holds and sim.grasp.grip_force == pytest.approx(force, rel=0.2)
 
 
 def test_a_ball_that_touches_the_bed_tells_its_force():
     """Driven into the bed beside the lobe, 2 mm/s and soft enough for 0.3 to 1.0 N to be met; the left one reads 0."""
-    one = Simulation(lobe("psm_pair", ports=(LEFT_PORT, RIGHT_PORT)))
-    pair = one.instrument
+    sim = Simulation(lobe("psm_pair", ports=(LEFT_PORT, RIGHT_PORT)))
+    pair = sim.instrument
     assert isinstance(pair, Pair)
-    one.restart(np.array([[0.02, 0.08, 0.03], [0.10, 0.020, 0.0036]]))
+    sim.restart(np.array([[0.02, 0.08, 0.03], [0.10, 0.020, 0.0036]]))
     forces = []
     for _ in range(6):
         pair.command_velocity(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.002]]))
-        one.control_step(50)
-        assert one.end_control_step(), one.fault
+        sim.control_step(50)
+        assert sim.end_control_step(), sim.fault
         forces.append(pair.touch_force("right", "bed"))
     assert forces[0] == 0.0 and 0.4 < forces[-1] < 1.0
     rises = np.diff(forces)
     assert rises.max() < 0.35, "one control step does not take it from below 0.3 N to above 1.0 N"
     for _ in range(20):
         pair.command_velocity(np.zeros((2, 3)))
-        one.control_step(50)
-    assert one.end_control_step(), one.fault
+        sim.control_step(50)
+    assert sim.end_control_step(), sim.fault
     assert pair.touch_force("right", "bed") == pytest.approx(forces[-1], rel=0.2)
     assert pair.touch_force("left", "bed") == 0.0 == pair.collision_force
-    assert not one.contact_wrench.any()
+    assert not sim.contact_wrench.any()
     with pytest.raises(KeyError, match="support_table"):
         pair.touch_force("right", "table")

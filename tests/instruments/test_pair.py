@@ -23,11 +23,11 @@ def simulation(places=START, *, compiled: bool = True) -> Simulation:
     return made
 
 
-def run(one: Simulation, steps: int, velocity=STILL, turning=None) -> None:
+def run(sim: Simulation, steps: int, velocity=STILL, turning=None) -> None:
     for _ in range(steps):
-        one.instrument.command_velocity(np.asarray(velocity), turning)
-        one.control_step(50)
-        assert one.end_control_step(), one.fault
+        sim.instrument.command_velocity(np.asarray(velocity), turning)
+        sim.control_step(50)
+        assert sim.end_control_step(), sim.fault
 
 
 def test_each_arm_stands_as_it_would_alone():
@@ -52,37 +52,37 @@ def test_each_arm_stands_as_it_would_alone():
 
 
 def test_each_tip_follows_its_own_line():
-    one = simulation(IN_THE_AIR)
+    sim = simulation(IN_THE_AIR)
     velocity = np.array([[0.01, 0.0, 0.02], [0.0, -0.015, -0.01]])
-    run(one, 10, velocity)
-    run(one, 4)
+    run(sim, 10, velocity)
+    run(sim, 4)
     for side, place, speed in zip(("left", "right"), IN_THE_AIR, velocity, strict=True):
-        np.testing.assert_allclose(one.instrument.arms[side].tip_position, place + 0.5 * speed, atol=3e-5)
-        assert np.linalg.norm(one.instrument.arms[side].tip_velocity) < 1e-3
-    assert not one.instrument.workspace_limited
-    one.instrument.arms["left"].command_jaw(-1.0)
-    run(one, 12)
-    assert one.instrument.jaw.opening == pytest.approx(0.0055, abs=2e-4)
+        np.testing.assert_allclose(sim.instrument.arms[side].tip_position, place + 0.5 * speed, atol=3e-5)
+        assert np.linalg.norm(sim.instrument.arms[side].tip_velocity) < 1e-3
+    assert not sim.instrument.workspace_limited
+    sim.instrument.arms["left"].command_jaw(-1.0)
+    run(sim, 12)
+    assert sim.instrument.jaw.opening == pytest.approx(0.0055, abs=2e-4)
     with pytest.raises(ValueError, match=r"psm_palpator.* has no jaw: it carries a palpator"):
-        one.instrument.arms["right"].command_jaw(0.0)
+        sim.instrument.arms["right"].command_jaw(0.0)
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.1])
 def test_arms_collide_and_do_not_pass_through_each_other(speed: float):
     """The right tip is sent 30 mm to the left, across the left wrist 12 mm away: there it stays, never deep in it."""
-    one = simulation(IN_THE_AIR)
-    pair = one.instrument
+    sim = simulation(IN_THE_AIR)
+    pair = sim.instrument
     pair.arms["left"].command_jaw(-1.0)
-    run(one, 11)
+    run(sim, 11)
     assert pair.distance > 0.005 and pair.collision_force == 0.0
     deepest, largest = 0.0, 0.0
     for _ in range(round(0.03 / speed / 0.05)):
         pair.command_velocity(np.array([[0.0, 0.0, 0.0], [-speed, 0.0, 0.0]]))
         for _ in range(50):
-            one.control_step(1)
-            one.instrument.refresh()
+            sim.control_step(1)
+            sim.instrument.refresh()
             deepest, largest = min(deepest, pair.distance), max(largest, pair.collision_force)
-    run(one, 40)
+    run(sim, 40)
     way = IN_THE_AIR[1, 0] - pair.arms["right"].tip_position[0]
     print(f"\n{speed} m/s: {deepest * 1e3:.2f} mm deep, {largest:.1f} N; came {way * 1e3:.1f} mm")
     assert pair.distance <= 0.0 and largest > 1.0
@@ -93,22 +93,22 @@ def test_arms_collide_and_do_not_pass_through_each_other(speed: float):
 
 def grasped(*, compiled: bool = True) -> Simulation:
     """The left arm holds the edge and the right one presses it from the side, the arms in contact."""
-    one = simulation(compiled=compiled)
-    one.instrument.arms["left"].command_jaw(-1.0)
-    run(one, 12)
-    run(one, 12, [[0.0, 0.0, 0.01], [-0.012, -0.02, 0.0]])
-    return one
+    sim = simulation(compiled=compiled)
+    sim.instrument.arms["left"].command_jaw(-1.0)
+    run(sim, 12)
+    run(sim, 12, [[0.0, 0.0, 0.01], [-0.012, -0.02, 0.0]])
+    return sim
 
 
 def test_both_arms_feel_the_organ_each_for_itself():
-    one = grasped()
-    pair, wrench = one.instrument, one.contact_wrench
+    sim = grasped()
+    pair, wrench = sim.instrument, sim.contact_wrench
     left, right = (pair.contact_force(side, wrench) for side in ("left", "right"))
-    np.testing.assert_allclose(left + right, one.contact_force, atol=1e-15)
+    np.testing.assert_allclose(left + right, sim.contact_force, atol=1e-15)
     assert sorted([*pair.tools_of("left"), *pair.tools_of("right")]) == list(range(pair.tool_count))
-    assert one.grasp.holds and one.grasp.grip_force > 0.1
+    assert sim.grasp.holds and sim.grasp.grip_force > 0.1
     fingers = wrench[pair.jaw.tools, :3].sum(axis=0)
-    np.testing.assert_allclose(one.grasp.pull_force, np.linalg.norm(fingers), rtol=1e-12)
+    np.testing.assert_allclose(sim.grasp.pull_force, np.linalg.norm(fingers), rtol=1e-12)
     # The right ball was driven 6 mm into the edge, towards -y: tissue pushes it back.
     assert right[1] > 0.02
 

@@ -153,7 +153,7 @@ def test_sliders_make_another_organ(bench):
 def test_an_organ_that_cannot_be_is_refused_and_the_last_one_stays(bench):
     bench.ask(Change(OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)))
     frame = bench.frame
-    assert bytes(frame["said"]).startswith(b"this organ cannot be made") and frame["organ"] == 1
+    assert bytes(frame["message"]).startswith(b"this organ cannot be made") and frame["organ"] == 1
     bench.step(200, bench.above)
     assert bench.frame["phase"] == Phase.RUNNING
 
@@ -163,7 +163,7 @@ def test_a_fault_stops_and_a_reset_goes_on(bench):
     bench.physics._simulation.organ_state.node_velocity[:, 2] = np.nan
     bench.step(5, bench.above)
     frame = bench.frame
-    assert frame["phase"] == Phase.FAULT and bytes(frame["said"])
+    assert frame["phase"] == Phase.FAULT and bytes(frame["message"])
     assert not bench.tip.force.any()
     bench.ask(Pause(False))
     assert bench.frame["phase"] == Phase.FAULT

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 
 from surgsim_apps.cli.main import main
-from surgsim_apps.palpate.job import COLUMNS
+from surgsim_apps.palpate.results import COLUMNS
 from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from surgsim_apps.palpate.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST, SITES, Hold, check_hold, hold_of
-from surgsim_apps.palpate.job import plan_sites
-from surgsim_apps.palpate.scene_options import soft_bed
+from surgsim_apps.palpate.sites import plan_sites
+from surgsim_apps.patient.supports import soft_bed
 from surgsim_env.scene.anatomy import anatomy_of, load_anatomy
 from surgsim_env.scene.load import make_material, make_scene
 from surgsim_env.scene.model import Anchor, Box

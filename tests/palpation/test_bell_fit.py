@@ -49,10 +49,10 @@ def test_it_is_the_least_squares_fit():
             solved = np.linalg.lstsq(rows, wanted, rcond=None)[0]
             if solved[-1] > 0.0 and np.abs(touch_map.numbers[felt] - touch_map.numbers[site]).max(axis=1).min() <= 1:
                 costs[site] = ((rows @ solved - wanted) ** 2).sum()
-        found = fit.best(*fit.cropped(np.stack([product, square])[:, None]))
-        assert fit.sites[found.site[0]] == min(costs, key=costs.__getitem__)
+        fitted = fit.best(*fit.cropped(np.stack([product, square])[:, None]))
+        assert fit.sites[fitted.site[0]] == min(costs, key=costs.__getitem__)
         # The parabola's top lies within half a cell of that site.
-        off = 0.5 * (found.place[0] - touch_map.places[fit.sites[found.site[0]]]) * SIDE
+        off = 0.5 * (fitted.place[0] - touch_map.places[fit.sites[fitted.site[0]]]) * SIDE
         assert np.abs(off).max() <= 0.5 * CELL + 1e-12
 
 

@@ -71,7 +71,7 @@ def test_no_site_lies_under_a_ligament():
     """A press there feels what holds the organ: several times the stiffness of the tissue, whatever hides below."""
     anatomy = load_anatomy(make_scene("liver"))
     charted = charted_face(anatomy)
-    (ligament,) = (one.ball for one in anatomy.scene.anchors if one.name == "falciform ligament, back")
+    (ligament,) = (anchor.ball for anchor in anatomy.scene.anchors if anchor.name == "falciform ligament, back")
     touch_map, chart, tip = charted.touch_map, charted.chart, charted.tip_radius
     on_face = [anatomy.face.site(*chart.plane_point(place).tolist()) for place in touch_map.places]
     held = anatomy.mesh.points[anatomy.foundation_nodes]

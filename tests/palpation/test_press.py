@@ -13,6 +13,6 @@ def test_a_press_with_a_fault_in_its_first_step_measures_nothing():
     anatomy = load_anatomy(make_scene("phantom_small"))
     simulation = Simulation(anatomy)
     simulation.reset(anatomy.organ(), simulation.instrument.upper)
-    found = press(simulation, np.array([0.03, 0.03, 0.0]), np.array([0.0, 0.0, -1.0]))
-    assert "contact lost" in found.end
-    assert found.force == 0.0 and found.depth == 0.0 and not len(found.curve)
+    result = press(simulation, np.array([0.03, 0.03, 0.0]), np.array([0.0, 0.0, -1.0]))
+    assert "contact lost" in result.end
+    assert result.force == 0.0 and result.depth == 0.0 and not len(result.curve)

@@ -1,10 +1,13 @@
 """A patient's scene: materials by names, and an organ without room for hidden lesions."""
 
+from dataclasses import replace
+
 import pytest
 import trimesh
 
 from surgsim_apps.cli.main import main
-from surgsim_apps.palpate.job import plan_sites
+from surgsim_apps.palpate.sites import plan_sites
+from surgsim_apps.patient import patient_scene
 from surgsim_apps.patient.materials import is_lesion, organ_material, region_material
 from surgsim_env.envs.ids import PalpateEnv
 from surgsim_env.scene.anatomy import load_anatomy
@@ -27,24 +30,24 @@ from surgsim_env.scene.load import load_scene
 )
 def test_materials_go_by_names(region, organ, lesion, modulus, source):
     healthy = organ_material(organ)
-    found = region_material(region, organ, healthy.material, {})
+    tissue = region_material(region, organ, healthy.material, {})
     assert is_lesion(region) == lesion
-    assert found.material.youngs_modulus == pytest.approx(modulus)
-    assert source in found.source
-    assert (found.material.density, found.material.poisson_ratio) == (1060.0, 0.45)
+    assert tissue.material.youngs_modulus == pytest.approx(modulus)
+    assert source in tissue.source
+    assert (tissue.material.density, tissue.material.poisson_ratio) == (1060.0, 0.45)
 
 
 @pytest.mark.slow
 def test_a_thin_organ_is_pressed_all_over_and_may_have_no_room_for_hidden_lesions(tmp_path, capsys, monkeypatch):
     """A plate of 16 mm, pressed 3.8 mm deep: less than five depths, more than three; lesions of 29 mm and more."""
-    monkeypatch.setattr("surgsim_apps.patient.patient_scene.LESION_SHRINKS", (1.5,))
+    monkeypatch.setattr(patient_scene, "LAYOUT", replace(patient_scene.LAYOUT, lesion_shrinks=(1.5,)))
     trimesh.creation.box((50.0, 40.0, 16.0)).export(tmp_path / "liver.stl")
     out = tmp_path / "a.vtu"
     given = ["organ", str(tmp_path / "liver.stl"), "--length-unit", "mm", "--cell-size", "0.004"]
     assert main([*given, "--out", str(out)]) == 0
-    said = capsys.readouterr().err
-    assert "the organ is thin: sites with 3 instead of 5 press depths of organ are pressed" in said
-    assert "the organ has no room for hidden lesions: there is no [lesion] table" in said
+    warnings = capsys.readouterr().err
+    assert "the organ is thin: sites with 3 instead of 5 press depths of organ are pressed" in warnings
+    assert "there is no [lesion] table" in warnings
     scene = load_scene(out.with_suffix(".toml"))
     assert scene.lesion is None
     assert scene.palpation.press_depth == pytest.approx(0.0038)

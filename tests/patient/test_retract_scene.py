@@ -1,4 +1,4 @@
-"""The scene of retraction of a patient's organ: which edge is lifted, what is written, and what takes it."""
+"""Retraction scene of a patient's organ: its edge, its files and its environments."""
 
 import re
 from pathlib import Path
@@ -13,16 +13,7 @@ from msdm_core.mesh_files.mesh_io import read_mesh
 from msdm_core.mesh_files.surface_io import read_surface
 from msdm_core.meshing.lattice_meshing import mesh_surface
 from surgsim_apps.cli.main import main
-from surgsim_apps.patient.retract_scene import (
-    JAW_OPENING,
-    JAW_PLAY,
-    OVERLAP_LEAST,
-    VOXEL,
-    OrganVoxels,
-    Rim,
-    _thickness,
-    find_rim,
-)
+from surgsim_apps.patient.rims import SEARCH, OrganVoxels, Rim, _thickness, find_rim
 from surgsim_env.scene.load import load_scene, make_retract_scene
 from surgsim_env.scripting.oracle import edge_section, oracle_script
 from surgsim_env.scripting.run import run_script
@@ -50,9 +41,9 @@ def scene(folder):
 
 @pytest.fixture(scope="module")
 def env(folder):
-    made = gym.make("SurgSim/Retract-v0", scene=str(folder / "patient.toml"))
-    yield made
-    made.close()
+    env = gym.make("SurgSim/Retract-v0", scene=str(folder / "patient.toml"))
+    yield env
+    env.close()
 
 
 @pytest.mark.slow
@@ -68,9 +59,9 @@ def test_the_patient_s_scene_names_its_scene_of_retraction(folder, scene):
 
 def test_it_is_the_same_organ_turned_by_what_the_file_says(folder, scene):
     text = (folder / "patient_retract.toml").read_text(encoding="utf-8")
-    line = next(one for one in text.splitlines() if one.startswith("#   o = "))
+    line = next(line for line in text.splitlines() if line.startswith("#   o = "))
     numbers = line.removeprefix("#   o = (").removesuffix(", one row each.").replace("), R = (", ", ").rstrip(")")
-    values = np.array([float(one) for one in numbers.replace(";", ",").split(",")])
+    values = np.array([float(number) for number in numbers.replace(";", ",").split(",")])
     origin, rotation = values[:3], values[3:].reshape(3, 3)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
     assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-5)
@@ -78,7 +69,7 @@ def test_it_is_the_same_organ_turned_by_what_the_file_says(folder, scene):
     # Nodes are numbered anew: compare what does not depend on it, to the digits of the file's comment.
     there = (plain.points - origin) @ rotation.T
     np.testing.assert_allclose(np.sort(there, axis=0), np.sort(turned.points, axis=0), atol=1e-6)
-    own, moved = (read_surface(folder / f"{one}_surface.ply", length_unit="m")[0] for one in ("patient", scene.name))
+    own, moved = (read_surface(folder / f"{name}_surface.ply", length_unit="m")[0] for name in ("patient", scene.name))
     np.testing.assert_allclose((own - origin) @ rotation.T, moved, atol=1e-6)
     for tag, name in plain.region_names:
         volume = plain.volumes[plain.region == tag].sum()
@@ -88,8 +79,8 @@ def test_it_is_the_same_organ_turned_by_what_the_file_says(folder, scene):
 def test_tissue_is_the_patient_s_and_lesions_are_part_of_it(folder, scene):
     patient = load_scene(folder / "patient.toml")
     assert (scene.material, scene.capsule) == (patient.material, patient.capsule)
-    assert [(one.name, one.material, one.lesion) for one in scene.regions] == [
-        (one.name, one.material, False) for one in patient.regions
+    assert [(region.name, region.material, region.lesion) for region in scene.regions] == [
+        (region.name, region.material, False) for region in patient.regions
     ]
     low, high = scene.retract.youngs_modulus
     assert low < patient.material.youngs_modulus < high
@@ -97,19 +88,19 @@ def test_tissue_is_the_patient_s_and_lesions_are_part_of_it(folder, scene):
 
 
 def test_an_edge_s_thickness_is_the_wedge_s(folder):
-    voxels = OrganVoxels(read_mesh(folder / "patient.vtu"), VOXEL)
+    voxels = OrganVoxels(read_mesh(folder / "patient.vtu"), SEARCH.voxel)
     # In the middle of the edge: outward is down, up to the front.
     frame = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]).T
-    found = _thickness(voxels, np.array([0.0, -0.5e-3 * WEDGE_EDGE, 0.0]), frame)
+    thickness = _thickness(voxels, np.array([0.0, -0.5e-3 * WEDGE_EDGE, 0.0]), frame)
     # To two voxels: cells of 7 mm round the edge off.
-    assert found == pytest.approx(1e-3 * (WEDGE_EDGE + WEDGE_SLOPE * 1e3 * OVERLAP_LEAST), abs=2 * VOXEL)
+    assert thickness == pytest.approx(1e-3 * (WEDGE_EDGE + WEDGE_SLOPE * 1e3 * SEARCH.overlap), abs=2 * SEARCH.voxel)
 
 
 @pytest.mark.slow
 def test_the_edge_s_level_side_is_below(folder):
     rim = find_rim(read_mesh(folder / "patient.vtu"), np.array([0.0, -1.0, 0.0]))
     assert isinstance(rim, Rim)
-    assert rim.thickness <= JAW_OPENING - JAW_PLAY
+    assert rim.thickness <= SEARCH.jaw_opening - SEARCH.jaw_play
     np.testing.assert_allclose(rim.frame.T @ rim.frame, np.eye(3), atol=1e-12)
     # The level side faces the back: up is to the front, -y of LPS, to 5 degrees.
     assert rim.frame[:, 2] @ [0.0, -1.0, 0.0] > np.cos(np.radians(5.0))
@@ -151,9 +142,9 @@ def test_the_oracle_lifts_the_wedge_s_edge(env):
 def test_a_ball_s_thickness_is_measured():
     sphere = trimesh.creation.icosphere(3, 0.030)
     mesh = mesh_surface(sphere.vertices, sphere.faces, cell_size=0.006)
-    found = find_rim(mesh, UP)
+    reason = find_rim(mesh, UP)
     # A chord 12 mm below the top of a ball of 30 mm, 48 mm; more where the jaw's width adds to it.
-    thickness = int(re.search(r"the thinnest is (\d+) mm thick", found)[1])
+    thickness = int(re.search(r"the thinnest is (\d+) mm thick", reason)[1])
     assert thickness == pytest.approx(2e3 * np.sqrt(0.03**2 - 0.018**2), abs=4)
 
 

@@ -13,8 +13,9 @@ import trimesh
 
 from surgsim_apps.cli.main import main
 from surgsim_apps.palpate.hold import FAR_SHARE_LARGEST, FORCE_SHARE_LEAST
-from surgsim_apps.palpate.job import MODEL, plan_sites
+from surgsim_apps.palpate.palpation import MODEL
 from surgsim_apps.palpate.scene_options import SceneOptions, with_options
+from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.patient.supports import held_text
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
 from surgsim_env.scene.load import load_scene

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from surgsim_env.rendering.cameras import Camera, filling, scene_cameras
+from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.options import CAMERAS
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, scene_from_table
@@ -27,19 +27,6 @@ def test_projection_is_a_pinholes():
     np.testing.assert_allclose(pixels, [[200, 200], [400, 200], [200, 0], [200, 300]], atol=1e-9)
     np.testing.assert_allclose(depth, [2.0, 2.0, 2.0, 4.0], atol=1e-12)
     assert np.linalg.det(camera.rotation) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("size", [(640, 480), (300, 600)])
-def test_a_filled_picture_has_all_points_and_no_more_room(size):
-    """Points touch both edges of its middle share along one axis."""
-    places = np.random.default_rng(3).normal(size=(60, 3)) * [1.0, 0.3, 0.5] + [4.0, -1.0, 2.0]
-    camera = filling(places, np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, 1.0]), 30.0, size[0] / size[1], 0.9)
-    pixels, depth = camera.project(places, *size)
-    assert (depth > 0.0).all()
-    at = 2.0 * pixels / size - 1.0
-    assert np.abs(at).max() == pytest.approx(0.9, abs=1e-9)
-    wide = int(np.argmax(np.ptp(at, axis=0)))
-    assert (at[:, wide].min(), at[:, wide].max()) == pytest.approx((-0.9, 0.9), abs=1e-9)
 
 
 @pytest.mark.parametrize("size", [(640, 480), (84, 84), (480, 640), (1280, 320)])

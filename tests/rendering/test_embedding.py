@@ -28,8 +28,8 @@ def turn(angle, axis):
 
 def test_lies_at_rest_where_the_file_has_it(ball):
     mesh, surface, vertices = ball
-    found, normals = surface.follow(mesh.points)
-    np.testing.assert_allclose(found, vertices, rtol=0, atol=1e-15)
+    result, normals = surface.follow(mesh.points)
+    np.testing.assert_allclose(result, vertices, rtol=0, atol=1e-15)
     # Not on the mesh, whose flat triangles cut the ball.
     assert np.linalg.norm(mesh.points, axis=1).max() < RADIUS * (1.0 + 1e-9)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, rtol=0, atol=1e-12)
@@ -39,16 +39,16 @@ def test_lies_at_rest_where_the_file_has_it(ball):
 def test_a_rigid_motion_moves_it_rigidly(ball):
     mesh, surface, vertices = ball
     rotation, shift = turn(1.1, np.array([1.0, -2.0, 0.5])), np.array([0.3, -0.2, 0.1])
-    found, normals = surface.follow(mesh.points @ rotation.T + shift)
-    np.testing.assert_allclose(found, vertices @ rotation.T + shift, rtol=0, atol=1e-12)
+    result, normals = surface.follow(mesh.points @ rotation.T + shift)
+    np.testing.assert_allclose(result, vertices @ rotation.T + shift, rtol=0, atol=1e-12)
     np.testing.assert_allclose(normals, surface.follow(mesh.points)[1] @ rotation.T, rtol=0, atol=1e-12)
 
 
 def test_a_linear_motion_moves_it_exactly(ball):
     mesh, surface, vertices = ball
     stretch = np.array([[1.2, 0.3, -0.1], [0.0, 0.8, 0.2], [0.1, -0.2, 1.1]])
-    found, _ = surface.follow(mesh.points @ stretch + 0.01)
-    np.testing.assert_allclose(found, vertices @ stretch + 0.01, rtol=0, atol=1e-14)
+    result, _ = surface.follow(mesh.points @ stretch + 0.01)
+    np.testing.assert_allclose(result, vertices @ stretch + 0.01, rtol=0, atol=1e-14)
 
 
 def test_a_bend_moves_it_more_smoothly_than_straight_tets_would():
@@ -74,10 +74,10 @@ def test_values_at_boundary_nodes_are_mixed_and_never_exceeded(ball):
     values[mesh.boundary_nodes] = mesh.points[mesh.boundary_nodes, 2]
     inner = np.setdiff1d(np.arange(mesh.node_count), mesh.boundary_nodes)
     assert len(inner)
-    found = surface.interpolate(np.nan_to_num(values, nan=1e9))
-    assert values[mesh.boundary_nodes].min() <= found.min() and found.max() <= values[mesh.boundary_nodes].max()
+    result = surface.interpolate(np.nan_to_num(values, nan=1e9))
+    assert values[mesh.boundary_nodes].min() <= result.min() and result.max() <= values[mesh.boundary_nodes].max()
     # At most the largest gap between ball and mesh, CELL^2 / (8 R) of an edge's middle, doubled for a triangle's.
-    assert np.abs(found - vertices[:, 2]).max() < 2.0 * 2.0 * CELL**2 / (8.0 * RADIUS)
+    assert np.abs(result - vertices[:, 2]).max() < 2.0 * 2.0 * CELL**2 / (8.0 * RADIUS)
     np.testing.assert_allclose(surface.interpolate(np.ones(mesh.node_count)), 1.0)
 
 

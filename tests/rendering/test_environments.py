@@ -23,7 +23,7 @@ def env_id(request):
 
 # Pictures go the same way for every id: one is enough where many are drawn.
 EACH_ID = pytest.mark.parametrize(
-    "env_id", [pytest.param(one, marks=[pytest.mark.slow] * (one != PALPATE)) for one in IDS], indirect=True
+    "env_id", [pytest.param(name, marks=[pytest.mark.slow] * (name != PALPATE)) for name in IDS], indirect=True
 )
 
 
@@ -36,14 +36,14 @@ def test_pictures_change_no_bit_of_an_episode(env_id):
     assert start[0][0].tobytes() == start[1][0].tobytes()
     touched = False
     for action in islice(walk(plain, np.random.default_rng(7)), 40):
-        one, other = plain.step(action), drawn.step(action)
+        plain_step, other = plain.step(action), drawn.step(action)
         drawn.render()
         drawn.renderer.depth("side")
         drawn.renderer.segmentation("endoscope")
-        assert one[0].tobytes() == other[0].tobytes() and one[1:] == other[1:]
+        assert plain_step[0].tobytes() == other[0].tobytes() and plain_step[1:] == other[1:]
         assert plain.save_state() == drawn.save_state()
         touched |= bool(drawn.simulation.contact_force.any())
-        if one[2]:
+        if plain_step[2]:
             break
     assert touched, "the walk must touch the organ to prove anything"
     drawn.close()

@@ -24,7 +24,7 @@ from surgsim_env.rendering.vessels import AXIS_COUNT, TEXTURE_WIDTH, texture_pla
 
 RETRACT = "SurgSim/Retract-v0"
 needs_opengl = pytest.mark.usefixtures("opengl")
-BANDS = [one.name for one in dataclasses.fields(LookRanges) if one.name.endswith("_bands")]
+BANDS = [entry.name for entry in dataclasses.fields(LookRanges) if entry.name.endswith("_bands")]
 
 
 def still(env):
@@ -37,10 +37,10 @@ def still(env):
 
 @pytest.mark.parametrize("name", BANDS)
 def test_training_and_evaluation_share_no_hue_and_no_vessel_spacing(name):
-    for one, other in itertools.product(getattr(TRAIN, name), getattr(TEST, name)):
-        assert one[1] < other[0] or other[1] < one[0]
+    for band, other in itertools.product(getattr(TRAIN, name), getattr(TEST, name)):
+        assert band[1] < other[0] or other[1] < band[0]
         # What is held out lies near what is trained on: within the range of all bands.
-        assert abs(one[0] - other[0]) < 200.0
+        assert abs(band[0] - other[0]) < 200.0
 
 
 def hue(colour):
@@ -54,10 +54,10 @@ def test_draws_lie_in_their_own_bands_alone(ranges, other):
     rng = look_generator(ranges, 5)
     looks = [draw_look(ranges, rng) for _ in range(200)]
     for name, values in (
-        ("tissue_hue_bands", [hue(one.tissue) for one in looks]),
-        ("drape_hue_bands", [hue(one.drape) for one in looks]),
-        ("target_hue_bands", [hue(one.target) for one in looks]),
-        ("vessel_bands", [one.vessel_density for one in looks]),
+        ("tissue_hue_bands", [hue(look.tissue) for look in looks]),
+        ("drape_hue_bands", [hue(look.drape) for look in looks]),
+        ("target_hue_bands", [hue(look.target) for look in looks]),
+        ("vessel_bands", [look.vessel_density for look in looks]),
     ):
         for value in values:
             assert any(low - 1e-6 <= value <= high + 1e-6 for low, high in getattr(ranges, name))
@@ -123,8 +123,8 @@ def test_each_triangle_is_stretched_by_sqrt_3_at_most():
     assert places.shape == (AXIS_COUNT * 60, 2)
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    one, two = (places[face_places[:, k]] - places[face_places[:, 0]] for k in (1, 2))
-    flat = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]) * TEXTURE_WIDTH**2
+    edge, two = (places[face_places[:, k]] - places[face_places[:, 0]] for k in (1, 2))
+    flat = np.abs(edge[:, 0] * two[:, 1] - edge[:, 1] * two[:, 0]) * TEXTURE_WIDTH**2
     assert (flat <= area * (1 + 1e-4)).all() and (flat >= area / np.sqrt(3.0) * (1 - 1e-4)).all()
 
 
@@ -151,8 +151,8 @@ def test_a_seed_repeats_pictures_to_the_bit_and_changes_nothing_else():
         env.action_space.seed(0)
     for _ in range(3):
         action = plain.action_space.sample()
-        one, two, three = plain.step(action), looked.step(action), again.step(action)
-        assert one[0]["force"].tobytes() == two[0]["force"].tobytes() and one[1:] == two[1:]
+        first, two, three = plain.step(action), looked.step(action), again.step(action)
+        assert first[0]["force"].tobytes() == two[0]["force"].tobytes() and first[1:] == two[1:]
         np.testing.assert_array_equal(two[0]["picture"], three[0]["picture"])
         assert plain.task_observation.tobytes() == looked.task_observation.tobytes()
     # Without a seed the next look is another one, and the same in both.
@@ -176,9 +176,9 @@ def test_a_loaded_state_has_its_look():
     assert env.look == other.look
     plain = gym.make(RETRACT, obs_mode="rgb").unwrapped
     plain.reset(seed=1)
-    for one, state in ((other, plain.save_state()), (plain, other.save_state())):
+    for receiver, state in ((other, plain.save_state()), (plain, other.save_state())):
         with pytest.raises(ValueError, match=r"entry 'look' is (missing|unknown)"):
-            one.load_state(state)
+            receiver.load_state(state)
     plain.close()
     env.close()
     other.close()

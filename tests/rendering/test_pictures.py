@@ -103,14 +103,14 @@ def test_depth_of_visible_nodes_is_their_distance(press, draw, camera):
     facing = (normals * towards).sum(axis=1) > 0.5 * np.linalg.norm(towards, axis=1)
     pixels, distance = view.project(vertices[facing], 640, 480)
     seen, inside = reach(pixels, 640, 480)
-    found, expected = depth[seen[:, 1], seen[:, 0]], distance[inside]
+    measured, expected = depth[seen[:, 1], seen[:, 0]], distance[inside]
     # On the outline the pixel beside it may be the one.
     nearest = np.min([depth[seen[:, 1] + dy, seen[:, 0] + dx] for dx in (-1, 0, 1) for dy in (-1, 0, 1)], axis=0)
     assert (nearest < expected + 1e-3).all()
     labels = renderer.segmentation()[seen[:, 1], seen[:, 0]]
-    visible = (labels == ORGAN) & (found > expected - 5e-3)
+    visible = (labels == ORGAN) & (measured > expected - 5e-3)
     assert visible.mean() > 0.7
-    np.testing.assert_allclose(found[visible], expected[visible], atol=1e-3)
+    np.testing.assert_allclose(measured[visible], expected[visible], atol=1e-3)
 
 
 def test_pressed_organ_looks_and_measures_differently(press, draw):
@@ -168,8 +168,8 @@ def test_lesion_is_seen_where_it_is_and_only_when_asked(press, draw, options):
 def test_cut_away_takes_the_near_side(press, draw):
     """Behind the cut the picture is farther away: nearest organ pixel of the whole and of the cut organ."""
     whole, cut = draw(press), draw(press, cut_away=True)
-    labels = [one.segmentation() for one in (whole, cut)]
-    nearest = [one.depth()[label == ORGAN].min() for one, label in zip((whole, cut), labels)]
+    labels = [renderer.segmentation() for renderer in (whole, cut)]
+    nearest = [renderer.depth()[label == ORGAN].min() for renderer, label in zip((whole, cut), labels)]
     assert nearest[1] > nearest[0] + 0.005
 
 

@@ -65,5 +65,5 @@ def test_missing_library_names_the_packages(tmp_path):
     """A file that is no library stands before the real one, as good as none."""
     for name in ("libEGL.so.1", "libEGL.so"):
         (tmp_path / name).write_text("not a library")
-    said = run(DRAW, LD_LIBRARY_PATH=str(tmp_path))
-    assert said.startswith("NoGLError no OpenGL through EGL") and PACKAGES in said and "MUJOCO_GL=egl" in said
+    output = run(DRAW, LD_LIBRARY_PATH=str(tmp_path))
+    assert output.startswith("NoGLError no OpenGL through EGL") and PACKAGES in output and "MUJOCO_GL=egl" in output

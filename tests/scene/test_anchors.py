@@ -39,8 +39,8 @@ def test_elastic_tissue_holds_by_its_surface_and_fixes_nothing():
     inside = np.flatnonzero(MESH.points[:, 2] <= 0.015)
     np.testing.assert_array_equal(fixed.anchors, inside)
     assert len(fixed.foundations) == len(elastic.anchors) == 0
-    (one,) = elastic.foundations
-    np.testing.assert_array_equal(one.nodes, np.intersect1d(inside, MESH.boundary_nodes))
+    (foundation,) = elastic.foundations
+    np.testing.assert_array_equal(foundation.nodes, np.intersect1d(inside, MESH.boundary_nodes))
     assert len(elastic.foundation_nodes) < len(inside)
     model = elastic.organ()
     np.testing.assert_array_equal(model.foundation_nodes, elastic.foundation_nodes)

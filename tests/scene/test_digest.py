@@ -29,5 +29,5 @@ def test_a_scene_is_known_by_its_content_and_not_by_its_folder():
     assert len({plain, scene_digest(softer, mesh), scene_digest(scene, moved)}) == 3
     arm = str(scenes_folder() / "instruments" / "psm_palpator.toml")
     copied = arm.replace("instruments", "elsewhere")
-    one, other = (replace(scene, instrument=replace(scene.instrument, model=name)) for name in (arm, copied))
-    assert scene_digest(one, mesh) == scene_digest(other, mesh) != plain
+    original, other = (replace(scene, instrument=replace(scene.instrument, model=name)) for name in (arm, copied))
+    assert scene_digest(original, mesh) == scene_digest(other, mesh) != plain

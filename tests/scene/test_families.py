@@ -41,8 +41,8 @@ def test_members_of_all_splits_differ_and_are_made_again_to_the_bit():
     template = block()
     members = [make_member(template, name) for name in names_of(SHAPES)]
     assert len(members) == 7
-    for one, other in combinations(members, 2):
-        assert np.abs(one.mesh.points - other.mesh.points).max() > 1e-3
+    for first, other in combinations(members, 2):
+        assert np.abs(first.mesh.points - other.mesh.points).max() > 1e-3
     for member in members:
         assert member.member is not None
         again = make_member(template, member.member)
@@ -94,8 +94,8 @@ def test_what_holds_and_is_pressed_moves_with_the_template():
     np.testing.assert_allclose(member.deformation(point[None])[0], carried, atol=1e-3)
     # Springs in the same order: only so can members stand side by side.
     np.testing.assert_array_equal(spring_order(member.mesh).springs, spring_order(template.mesh).springs)
-    one, other = (anatomy.specification().mesh.edges for anatomy in (template, member))
-    np.testing.assert_array_equal(one, other)
+    edges, other = (anatomy.specification().mesh.edges for anatomy in (template, member))
+    np.testing.assert_array_equal(edges, other)
     assert [lesion.name for lesion in member.demonstration_lesions()] == [
         lesion.name for lesion in template.demonstration_lesions()
     ]
@@ -125,7 +125,7 @@ def test_a_fold_is_drawn_again(monkeypatch):
         shape = make(family, of, rng)
         spoiled = [
             replace(
-                shape, bump_place=np.zeros((1, 3)), bump_way=np.array([[0.02, 0, 0]]), bump_width=np.array([0.004])
+                shape, bump_place=np.zeros((1, 3)), bump_shift=np.array([[0.02, 0, 0]]), bump_width=np.array([0.004])
             ),
             replace(shape, stretch=np.array([1.0, 1.0, 0.05])),
             replace(shape, stretch=np.array([1.6, 1.0, 1.0])),

@@ -50,15 +50,15 @@ def test_numbers_of_lesions_capsules_and_moduli_come_as_often_as_the_level_says(
     anatomy = replace(anatomy, scene=replace(anatomy.scene, lesion=tiny))
     count = 400
     drawn = [level.draw(anatomy, np.random.default_rng(seed)) for seed in range(count)]
-    numbers = np.bincount([len(one.lesions) for one in drawn], minlength=4)
+    numbers = np.bincount([len(sample.lesions) for sample in drawn], minlength=4)
     for number, weight in zip(numbers, level.lesion_count_weights, strict=True):
         # Four standard deviations of a binomial share.
         assert abs(number - count * weight) <= 4.0 * math.sqrt(count * weight * (1.0 - weight))
-    capsules = [one.capsule_stiffness for one in drawn if one.capsule_stiffness > 0.0]
+    capsules = [sample.capsule_stiffness for sample in drawn if sample.capsule_stiffness > 0.0]
     assert abs(len(capsules) - 0.5 * count) <= 4.0 * math.sqrt(0.25 * count)
     assert 5.0 <= min(capsules) < 6.0 and 19.0 < max(capsules) <= 20.0
     # A uniform number of width w has the standard deviation w / sqrt(12).
-    background = np.array([one.background for one in drawn])
+    background = np.array([sample.background for sample in drawn])
     assert abs(background.mean() - 1.0) < 4.0 * 0.6 / math.sqrt(12.0 * count)
     assert background.std() == pytest.approx(0.6 / math.sqrt(12.0), rel=0.1)
 
@@ -67,9 +67,9 @@ def test_a_draw_survives_json_to_the_bit_and_differs_from_the_scenes_organ():
     level = LEVELS["standard"]
     anatomy = load_anatomy(level.scene(make_scene("phantom_small")))
     drawn = next(
-        one
-        for one in (level.draw(anatomy, np.random.default_rng(seed)) for seed in range(40))
-        if one.capsule_stiffness > 0.0 and len(one.lesions) == 2
+        sample
+        for sample in (level.draw(anatomy, np.random.default_rng(seed)) for seed in range(40))
+        if sample.capsule_stiffness > 0.0 and len(sample.lesions) == 2
     )
     again = DrawnOrgan.from_json(drawn.to_json(), anatomy)
     assert again == drawn

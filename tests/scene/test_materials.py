@@ -26,11 +26,11 @@ def scene_with(material, folder=Path("."), **entries):
 
 @pytest.mark.parametrize("name", list_materials())
 def test_every_material_states_source_condition_and_interval(name):
-    found = make_material(name)
-    assert found.name == name and found.description
+    material = make_material(name)
+    assert material.name == name and material.description
     for key in ("source", "condition", "interval"):
-        said = getattr(found, key)
-        assert said != "not stated" and said.strip() and "  " not in said, key
+        text = getattr(material, key)
+        assert text != "not stated" and text.strip() and "  " not in text, key
 
 
 def test_pig_liver_stiffens_and_relaxes_as_its_file_says():
@@ -45,24 +45,24 @@ def test_pig_liver_stiffens_and_relaxes_as_its_file_says():
 
 
 def test_one_number_of_the_law_is_overridden_alone():
-    found = scene_with({"name": "pig_liver_ex_vivo", "stiffening": {"tangent_cap": 20}}).material.stiffening
+    stiffening = scene_with({"name": "pig_liver_ex_vivo", "stiffening": {"tangent_cap": 20}}).material.stiffening
     library = make_material("pig_liver_ex_vivo").material.stiffening
-    assert found is not None and library is not None
-    assert found == replace(library, tangent_cap=20.0)
+    assert stiffening is not None and library is not None
+    assert stiffening == replace(library, tangent_cap=20.0)
 
 
 def test_regions_take_materials_too():
     region = {"name": "tumour", "lesion": True, "material": {"name": "prostate_cancer_ex_vivo", "poisson_ratio": 0.4}}
-    found = scene_with({"name": "prostate_ex_vivo"}, regions=[region])
-    assert found.material.youngs_modulus == 17000.0
-    assert (found.regions[0].material.youngs_modulus, found.regions[0].material.poisson_ratio) == (24100.0, 0.4)
+    scene = scene_with({"name": "prostate_ex_vivo"}, regions=[region])
+    assert scene.material.youngs_modulus == 17000.0
+    assert (scene.regions[0].material.youngs_modulus, scene.regions[0].material.poisson_ratio) == (24100.0, 0.4)
 
 
 def test_a_file_of_ones_own_is_found_beside_the_scene(tmp_path):
     (tmp_path / "mine.toml").write_text(OWN)
     assert scene_with({"name": "mine.toml"}, folder=tmp_path).material == Material(7000.0, 1030.0, 0.3)
-    found = make_material(tmp_path / "mine.toml")
-    assert found.name == "mine" and found.source == "not stated"
+    material = make_material(tmp_path / "mine.toml")
+    assert material.name == "mine" and material.source == "not stated"
 
 
 @pytest.mark.parametrize(

@@ -62,9 +62,9 @@ def strategy(kind, owner=None, name=""):
 def instances(draw, kind):
     """Instances of a dataclass, from strategies for its fields."""
     hints = typing.get_type_hints(kind)
-    values = {one.name: draw(strategy(hints[one.name], kind, one.name)) for one in fields(kind)}
+    values = {entry.name: draw(strategy(hints[entry.name], kind, entry.name)) for entry in fields(kind)}
     if kind in ONE_OF:
-        optional = [one.name for one in fields(kind) if one.default is None]
+        optional = [entry.name for entry in fields(kind) if entry.default is None]
         kept = draw(st.sampled_from(optional))
         (part,) = (part for part in typing.get_args(hints[kept]) if part is not type(None))
         values |= {**dict.fromkeys(optional), kept: draw(strategy(part))}

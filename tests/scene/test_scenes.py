@@ -148,14 +148,14 @@ def test_with_added_mass_fewer_substeps_measure_the_same():
     )
     lesion = anatomy.random_lesion(np.random.default_rng(1))
 
-    def organ_of(one):
-        return one.organ([lesion])
+    def organ_of(case):
+        return case.organ([lesion])
 
-    fewer = with_added_mass(anatomy, lambda one: [organ_of(one)])
+    fewer = with_added_mass(anatomy, lambda case: [organ_of(case)])
     assert fewer.scene.timing.substep_count == 3
     assert 0.0 < organ_of(fewer).added_mass <= ADDED_MASS_SHARE * organ_of(fewer).node_mass.sum()
     point, normal = anatomy.face.project(np.array(lesion.centre))
-    forces = [scan(one, organ_of(one), point[None], normal[None])[0].force for one in (anatomy, fewer)]
+    forces = [scan(case, organ_of(case), point[None], normal[None])[0].force for case in (anatomy, fewer)]
     assert forces[1] == pytest.approx(forces[0], rel=1e-3)
 
 

@@ -69,9 +69,9 @@ def test_a_tool_meets_the_bed_alike_in_both_loops(place: str, instrument: str | 
             simulated.instrument.command_velocity(np.array(speed))
             simulated.control_step(50)
             assert simulated.end_control_step(), simulated.fault
-        one, other = (simulated.get_state() for simulated in both)
+        first, other = (simulated.get_state() for simulated in both)
         for name, array in other.items():
-            assert one[name].tobytes() == array.tobytes(), name
+            assert first[name].tobytes() == array.tobytes(), name
         met += int(both[0].instrument.data.ncon)
         assert np.linalg.norm(both[0].instrument.tip_velocity) < 0.03
     assert (met > 0) == (place == "bare bed")

@@ -34,10 +34,10 @@ def test_a_recorded_episode_is_the_unrecorded_one_to_the_bit(instrument):
     touched = False
     with watched.simulation.recording() as record:
         for action in actions(20):
-            one, other = plain.step(action), watched.step(action)
-            assert one[0].tobytes() == other[0].tobytes()
-            assert one[1:] == other[1:]
-            touched |= one[-1]["force_peak"] > 0.1
+            plain_step, other = plain.step(action), watched.step(action)
+            assert plain_step[0].tobytes() == other[0].tobytes()
+            assert plain_step[1:] == other[1:]
+            touched |= plain_step[-1]["force_peak"] > 0.1
             # Nothing of the instrument's data differs either, poses included.
             for name in ("qpos", "qvel", "qacc", "ctrl", "xpos", "xipos", "site_xpos", "xfrc_applied"):
                 mine = getattr(plain.simulation.instrument.data, name)
@@ -95,5 +95,5 @@ def test_a_step_cut_short_by_the_hard_limit_is_recorded_as_far_as_it_went():
             _, _, over, _, info = env.step(np.array([0.0, 0.0, -1.0, 0.0], dtype=np.float32))
     sizes = np.linalg.norm(record.wrench[:, :, :3].sum(axis=1), axis=1)
     assert info["hard_limit"] and len(record) % 50
-    assert (sizes[:-1] <= env.task.force_limit).all() and sizes[-1] > env.task.force_limit
+    assert (sizes[:-1] <= env.runtime.force_limit).all() and sizes[-1] > env.runtime.force_limit
     assert sizes.max() == pytest.approx(info["force_peak"], rel=1e-15)

@@ -46,7 +46,7 @@ def test_numbers_that_are_not_above_zero(place, value):
     step, field = place
     with pytest.raises(ValueError) as caught:
         MADE[step](**{field: value})
-    assert str(caught.value).startswith(f"{step}: {field} is {value!r}; it must be a finite number above 0")
+    assert str(caught.value).startswith(f"{step}: {field} is {value!r}")
 
 
 POINTS = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3)
@@ -80,7 +80,7 @@ def test_a_wrapper_that_changes_actions(env):
 def test_other_environments_and_several_at_once():
     with pytest.raises(TypeError, match="CartPoleEnv"):
         run_script(gym.make("CartPole-v1"), [Hold(0.1)])
-    with pytest.raises(TypeError, match="several"):
+    with pytest.raises(TypeError, match="vector"):
         run_script(gym.make_vec("CartPole-v1", num_envs=2), [Hold(0.1)])
     with pytest.raises(TypeError, match="PalpateSitesTask"):
         run_script(gym.make("SurgSim/PalpateSites-v0", scene="phantom_small"), [Hold(0.1)])

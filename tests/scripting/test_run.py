@@ -13,10 +13,10 @@ ARRAYS = (
 )
 
 
-def assert_same(one, other, names=(*ARRAYS, "depth")):
+def assert_same(first, other, names=(*ARRAYS, "depth")):
     for name in names:
-        assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
-    assert one.infos == other.infos
+        assert getattr(first, name).tobytes() == getattr(other, name).tobytes(), name
+    assert first.infos == other.infos
 
 
 def press():
@@ -29,10 +29,10 @@ def test_a_run_goes_on_from_a_saved_state_to_the_bit(instrument):
     whole = run_script(env, press(), seed=7)
     run_script(env, press()[:1], seed=7)
     saved = env.unwrapped.save_state()
-    for one in (env, other):
-        one.reset(seed=1)
-        one.unwrapped.load_state(saved)
-        rest = run_script(one, press()[1:])
+    for target in (env, other):
+        target.reset(seed=1)
+        target.unwrapped.load_state(saved)
+        rest = run_script(target, press()[1:])
         part = whole.between("Hold", "Lift")
         assert rest.start == part.start and rest.steps == part.steps
         # Depth counts from where the contact began in the run: all else is the same.
@@ -50,7 +50,7 @@ def test_what_a_wrapper_makes_of_observations_is_what_a_controller_sees():
         gym.make("SurgSim/Palpate-v0"), lambda observation: observation[6:9], gym.spaces.Box(-2.0, 2.0, (3,))
     )
     trace = run_script(env, [Control(controller, timeout=0.1)], seed=3)
-    assert trace.observation.shape == (2, 3) and [one.shape for one in seen] == [(3,), (3,)]
+    assert trace.observation.shape == (2, 3) and [part.shape for part in seen] == [(3,), (3,)]
     # Steps of ours go on reading the environment's own.
     trace = run_script(env, [PressUntil(0.1, 0.008, sensed=True), Control(controller, timeout=0.05)])
     assert trace.peak_force > 0.05
@@ -75,7 +75,7 @@ def oracle_run(scene, instrument, seeds):
 
 
 @pytest.mark.parametrize(
-    ("scene", "instrument"), [*CASES[:2], *(pytest.param(*one, marks=pytest.mark.slow) for one in CASES[2:])]
+    ("scene", "instrument"), [*CASES[:2], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[2:])]
 )
 def test_the_oracle_finds_the_lesion_gently(scene, instrument):
     ((env, trace),) = oracle_run(scene, instrument, [1])

@@ -59,7 +59,7 @@ def test_press_hold_lift(instrument, force):
 def test_a_press_by_the_sensor_stops_where_the_sensor_says():
     env = above()
     bias, noise = 0.1, env.unwrapped.scene.sensor.noise
-    env.unwrapped.task.sensors["contact_force"].bias = np.array([0.0, 0.0, bias])
+    env.unwrapped.runtime.sensors["contact_force"].bias = np.array([0.0, 0.0, bias])
     trace = run_script(env, [PressUntil(0.2, 0.008, sensed=True)])
     assert trace.observation[-1, 8] >= 0.19
     # The true force lacks the bias; within the tolerance and four standard deviations of the reading that ended it.

@@ -21,7 +21,11 @@ def test_validate(tmp_path, monkeypatch, capsys, spoilt, status):
     printed = capsys.readouterr().out
     assert "Table I" in printed and f"{int(spoilt)} not met" in printed
     report = (tmp_path / "validation.md").read_text(encoding="utf-8")
-    assert "| Table I, h/a 0.40365, min cell | Sala 2011, Table I | -50.74 % |" in report
-    assert ("a wrong one" in report) == spoilt
+    assert "| Table I | Sala 2011, Table I | +0.00565 % | 0.02 % | 5 met |" in report
+    assert ("| a wrong one | by hand | +100 % | 10 % | 1 not met |" in report) == spoilt
+    assert "    * bar in tension, cell 5.0 mm: +7.2 %, tolerance 7 %" in report
+    table = (tmp_path / "validation.csv").read_text(encoding="utf-8")
+    assert '"Table I, h/a 0.40365, min cell","Sala 2011, Table I",-50.74 %,' in table
+    assert ("a wrong one" in table) == spoilt
     assert (tmp_path / "images" / "validation_convergence.png").read_bytes().startswith(b"\x89PNG")
     assert "images/validation_convergence.png" in report

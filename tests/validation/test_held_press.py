@@ -9,8 +9,8 @@ from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import LinearOperator, cg, spilu
 
-from surgsim_apps.palpate.job import plan_sites
-from surgsim_apps.palpate.scene_options import soft_bed
+from surgsim_apps.palpate.sites import plan_sites
+from surgsim_apps.patient.supports import soft_bed
 from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import Anatomy, anatomy_of
 from surgsim_env.scene.load import make_material, make_scene

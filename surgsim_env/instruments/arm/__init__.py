@@ -1,1 +1,1 @@
-"""Robot arms: one arm, two arms, inverse kinematics, placement at ports."""
+"""Robot arms, alone or in pairs: models, ports, inverse kinematics, control."""

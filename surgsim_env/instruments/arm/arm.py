@@ -19,27 +19,27 @@ from surgsim_env.scene.palpable_surface import tangent_axes
 
 
 class Pose(NamedTuple):
-    """A position [m] (3,) and the axes of a frame there as columns (3, 3), world frame."""
+    """Position [m] (3,) and axes of a frame as columns (3, 3), world frame."""
 
     position: FloatArray
     rotation: FloatArray
 
 
 class Arm:
-    """Kinematics of an arm at a port, as functions of joint values; no state is kept.
+    """Kinematics of an arm at a port, as functions of joint values; without state.
 
     Fields:
-        description, port: as given
+        description, port: of the arm
         model: MuJoCo's model of the arm alone
         joints: names of the driven joints, base to tip
         qpos, dof: their indices in MuJoCo's coordinates and velocities          (n,)
         lower, upper: limits [rad or m]                                          (n,)
         speed_limit: [rad/s or m/s]                                              (n,)
         home: [rad or m]                                                         (n,)
-        shape_names, shape_radius: outer shapes (felt ones first) and radii [m]; a box counts as the capsule of the
+        shape_names, shape_radius: outer shapes (contact geoms first) and radii [m]; a box counts as the capsule of the
             same length around its cross-section                                 (n_shape,)
-        shape_half_axis: from the middle of each shape to its end, in its geom's frame [m]  (n_shape, 3)
-        felt: whether tissue feels a shape                                       (n_shape,)
+        shape_half_axis: vector from the middle of each shape to its end, in its geom's frame [m]  (n_shape, 3)
+        felt: True for shapes in contact with tissue                             (n_shape,)
         shapes, tip_site, shaft: indices of the shapes' geoms, the tip's site and the shaft's body in the model
         tip_axis: unit vector out of the tip, in its site's frame                (3,)
         shaft_point, shaft_axis: point [m] and direction of the shaft's axis, in its body's frame      (3,)
@@ -47,7 +47,7 @@ class Arm:
     """
 
     def __init__(self, description: ArmDescription, port: Port, model: mujoco.MjModel) -> None:
-        """Take a model compiled for the description and the port."""
+        """Take the compiled model of a description at a port."""
         self.description, self.port, self.model = description, port, model
         self.joints = description.joints
         index = [model.joint(name).id for name in self.joints]
@@ -81,11 +81,11 @@ class Arm:
 
     @property
     def remote_centre_fixed(self) -> bool:
-        """Whether the mechanism itself keeps the shaft in the trocar."""
+        """True if the mechanism itself keeps the shaft in the trocar."""
         return self.description.trocar.fixed
 
     def tip_pose(self, joints: ArrayLike) -> Pose:
-        """Pose of the tip at joint values (n,); the frame is that of the description's site or body."""
+        """Pose of the tip at joint values (n,), in the frame of the description's site or body."""
         data = self._at(joints)
         return Pose(data.site_xpos[self.tip_site].copy(), data.site_xmat[self.tip_site].reshape(3, 3).copy())
 
@@ -94,13 +94,13 @@ class Arm:
         return matmul(self._at(joints).site_xmat[self.tip_site].reshape(3, 3), self.tip_axis)
 
     def tip_jacobian(self, joints: ArrayLike) -> FloatArray:
-        """Jacobian from joint speeds to the tip's velocity [m/s] and angular velocity [rad/s], world frame, (6, n)."""
+        """Jacobian of the tip's velocity [m/s] and angular velocity [rad/s], world frame, (6, n)."""
         data = self._at(joints, moving=True)
         mujoco.mj_jacSite(self.model, data, self._jacobian[:3], self._jacobian[3:], self.tip_site)
         return self._jacobian[:, self.dof]
 
     def shaft_line(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """The point of the shaft's axis nearest to the trocar [m] and its direction to the tip, each (3,)."""
+        """Point of the shaft's axis nearest to the trocar [m] and its direction to the tip, each (3,)."""
         data = self._at(joints)
         rotation = data.xmat[self.shaft].reshape(3, 3)
         start, along = data.xpos[self.shaft] + matmul(rotation, self.shaft_point), matmul(rotation, self.shaft_axis)
@@ -127,7 +127,7 @@ class Arm:
         return np.stack([centre - axis, centre + axis], axis=1)
 
     def manipulability(self, joints: ArrayLike) -> float:
-        """Yoshikawa's sqrt(det J J^T) of the tip's velocity over all joints; units follow from those of the joints."""
+        """Yoshikawa's sqrt(det J J^T) of the tip's velocity over all joints; its unit follows from the joints'."""
         linear = self.tip_jacobian(joints)[:3]
         return float(np.sqrt(np.prod(np.maximum(eigh(matmul(linear, linear.T))[0], 0.0))))
 
@@ -158,11 +158,11 @@ def load_arm(
 
     Args:
         source: a shipped arm's name, the path of a TOML file, or a description.
-        port: where the arm enters the body.
+        port: of the arm.
         tip_radius: of the tip's ball [m]; by default the model's.
         timestep: of MuJoCo [s].
-        supports: bodies in the world that its tools touch.
-        supports_move: whether these move with the organ's ground.
+        supports: bodies in the world in contact with its tools.
+        supports_move: True if these move with the organ's ground.
 
     Raises:
         ValueError: a wrong entry (names the arm, the entry and the remedy).
@@ -176,27 +176,27 @@ def load_arm(
 
 def _check_trocar(arm: Arm) -> None:
     """Check that the shaft passes through the trocar at home, and at any joint values for a fixed remote centre."""
-    trocar, where = arm.description.trocar, f"arm {arm.description.name!r}"
-    missed = arm.trocar_residual(arm.home)
-    if not missed <= trocar.tolerance:
+    trocar, name = arm.description.trocar, f"arm {arm.description.name!r}"
+    residual = arm.trocar_residual(arm.home)
+    if not residual <= trocar.tolerance:
         raise ValueError(
-            f"{where}: at home the shaft's axis passes the trocar at {missed * 1e3:.3g} mm, more than "
+            f"{name}: at home the shaft's axis passes the trocar at {residual * 1e3:.3g} mm, more than "
             f"trocar.tolerance = {trocar.tolerance * 1e3:.3g} mm: change home, trocar.point or trocar.shaft_axis"
         )
     near, along = arm.shaft_line(arm.home)
     if matmul(arm.tip_pose(arm.home).position - near, along) <= 0.0:
         raise ValueError(
-            f"{where}: at home the tip has not passed the trocar: move home further in, or turn trocar.shaft_axis, "
+            f"{name}: at home the tip has not passed the trocar: move home further in, or turn trocar.shaft_axis, "
             "which points towards the tip"
         )
     if not trocar.fixed:
         return
     for share in np.random.default_rng(0).random((32, arm.joint_count)):
-        missed = arm.trocar_residual(arm.lower + share * (arm.upper - arm.lower))
-        if not missed <= trocar.tolerance:
+        residual = arm.trocar_residual(arm.lower + share * (arm.upper - arm.lower))
+        if not residual <= trocar.tolerance:
             raise ValueError(
-                f"{where}: trocar.fixed says that the mechanism keeps the shaft in the trocar, but it leaves it by "
-                f"{missed * 1e3:.3g} mm within the joints' limits: use fixed = false"
+                f"{name}: trocar.fixed says that the mechanism keeps the shaft in the trocar, but it leaves it by "
+                f"{residual * 1e3:.3g} mm within the joints' limits: use fixed = false"
             )
 
 

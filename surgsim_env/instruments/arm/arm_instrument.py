@@ -1,4 +1,4 @@
-"""One arm as the instrument of a scene, and the parts that two arms share: ports and servos."""
+"""One arm as the instrument of a scene; ports and servos, shared with pairs of arms."""
 
 import math
 
@@ -20,14 +20,14 @@ from surgsim_env.scene.palpable_surface import PalpableFace, tangent_axes
 # from the approach is 6.5 cm beside it (port placement for da Vinci: docs/arms.md).
 PORT_DISTANCE = 0.13
 PORT_TILT = math.radians(30.0)
-# Before the first reset the tip is this far above the middle of the palpable face [m].
+# Height of the tip above the middle of the palpable face before the first reset [m].
 PARKED_GAP = 0.010
-# Number of places on the palpable face that an arm must reach.
-PLACES_TRIED = 24
+# Number of places on the palpable face to be reached by an arm.
+PLACES_CHECKED = 24
 
 
 class SteeredArms(Instrument):
-    """An instrument of one arm or two.
+    """Instrument of one arm or two.
 
     Fields:
         arms: control of each arm, by its side; an arm alone has the side ""
@@ -38,29 +38,29 @@ class SteeredArms(Instrument):
 
     @property
     def workspace_limited(self) -> bool:
-        """Whether the box, a joint's limit or its speed limit stopped the commanded motion of a tip."""
-        return any(one.limited for one in self.arms.values())
+        """True if the box, a joint's limit or its speed limit stopped the commanded motion of a tip."""
+        return any(arm.limited for arm in self.arms.values())
 
     @property
     def trocar_residual(self) -> float:
-        """Distance of the shaft's axis from the trocar at the current joint values [m], the larger one of two arms."""
-        return max(one.trocar_residual for one in self.arms.values())
+        """Distance of the shaft's axis from the trocar at the current joint values [m], the larger of two arms'."""
+        return max(arm.trocar_residual for arm in self.arms.values())
 
     def get_state(self) -> FloatArray:
-        """All of the instrument's state, commands and wanted directions included, as one vector."""
-        return np.concatenate([super().get_state(), *(one.get_state() for one in self.arms.values())])
+        """Whole state of the instrument, with commands and commanded directions, as a vector."""
+        return np.concatenate([super().get_state(), *(arm.get_state() for arm in self.arms.values())])
 
     def set_state(self, state: FloatArray) -> None:
-        """Restore what `get_state` gave, to the bit; contact forces are updated by the next haptic step."""
-        sizes = [len(one.get_state()) for one in self.arms.values()]
+        """Restore a state from `get_state`, to the bit; contact forces are updated by the next haptic step."""
+        sizes = [len(arm.get_state()) for arm in self.arms.values()]
         own, *parts = np.split(state, np.cumsum([len(state) - sum(sizes), *sizes])[:-1])
         super().set_state(own)
-        for one, part in zip(self.arms.values(), parts, strict=True):
-            one.set_state(part)
+        for arm, part in zip(self.arms.values(), parts, strict=True):
+            arm.set_state(part)
 
 
 class ArmInstrument(SteeredArms):
-    """An arm at a scene's port, steered by its tip's velocity through inverse kinematics.
+    """Arm at a scene's port, commanded by its tip's velocity through inverse kinematics.
 
     Fields:
         arm: its kinematics
@@ -95,15 +95,10 @@ class ArmInstrument(SteeredArms):
         self._check_reach(anatomy)
         self.place(self.parked)
 
-    @property
-    def joint_positions(self) -> FloatArray:
-        """Values of the driven joints [rad or m], (n,)."""
-        return self.steered.joint_positions
-
     def place(self, position: FloatArray) -> None:
         """Place the tip at rest at a position [m], in the start direction as far as the joints allow.
 
-        A jaw with pads is open, another one is as when loaded.
+        A jaw with pads is opened, another jaw is reset.
 
         Raises:
             ValueError: the tip does not reach the position (gives the distance and the port).
@@ -123,20 +118,20 @@ class ArmInstrument(SteeredArms):
         return self.steered.where
 
     def _check_reach(self, anatomy: Anatomy) -> None:
-        """The tip comes to places all over the palpable face."""
+        """Check that the tip reaches places all over the palpable face."""
         face, retract = anatomy.face, anatomy.scene.retract
         if retract is not None and retract.flap is not None:
             # Only the edge of a flap is grasped.
             return
         corners = face.points[face.triangles]
         thick = np.flatnonzero(face.thickness >= face.thickness_smallest)
-        tried = thick[np.linspace(0, len(thick) - 1, min(PLACES_TRIED, len(thick))).astype(int)]
-        for place in corners[tried].mean(axis=1) - anatomy.scene.instrument.tip_radius * face.approach:
-            found = self.steered.reach(place)
-            if not placed(found):
+        checked = thick[np.linspace(0, len(thick) - 1, min(PLACES_CHECKED, len(thick))).astype(int)]
+        for place in corners[checked].mean(axis=1) - anatomy.scene.instrument.tip_radius * face.approach:
+            solution = self.steered.reach(place)
+            if not placed(solution):
                 raise ValueError(
                     f"{self._where()} does not reach the palpable face of scene {anatomy.scene.name!r} at "
-                    f"{millimetres(place)}: {missing(found)}; move its [port]"
+                    f"{millimetres(place)}: {missing(solution)}; move its [port]"
                 )
 
 
@@ -160,7 +155,7 @@ def load_scene_arm(anatomy: Anatomy, name: str, port: Port) -> Arm:
 
 
 def default_port(face: PalpableFace) -> Port:
-    """A port above the palpable face: 13 cm from its middle, at 30 degrees from the approach."""
+    """Port above the palpable face, 13 cm from its middle, at 30 degrees from the approach."""
     corners = face.points[face.triangles]
     area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     target = matmul(area, corners.mean(axis=1)) / area.sum()
@@ -171,14 +166,14 @@ def default_port(face: PalpableFace) -> Port:
     return Port((x, y, z), (u, v, w))
 
 
-def check_port_outside(port: Port, anatomy: Anatomy, *, what: str = "the port") -> None:
-    """Refuse a port inside an organ.
+def check_port_outside(port: Port, anatomy: Anatomy, *, name: str = "the port") -> None:
+    """Check that a port is outside the organ.
 
     Raises:
-        ValueError: the port is inside (names its place and the organ).
+        ValueError: the port is inside (states its place and the scene).
     """
     corners = anatomy.mesh.points[anatomy.mesh.tets]
-    # It is in a tet whose volume [m^3] stays positive, but for rounding on a face, whichever corner is moved to it.
+    # Inside a tet the volume [m^3] stays positive, but for rounding, with any corner moved to the port.
     inside = np.ones(len(corners), dtype=bool)
     for corner in range(4):
         moved = corners.copy()
@@ -187,7 +182,7 @@ def check_port_outside(port: Port, anatomy: Anatomy, *, what: str = "the port") 
         inside &= (np.cross(a, b) * c).sum(axis=1) >= -1e-15
     if inside.any():
         raise ValueError(
-            f"{what} at {millimetres(np.array(port.point))} lies inside the organ of scene {anatomy.scene.name!r}: "
+            f"{name} at {millimetres(np.array(port.point))} lies inside the organ of scene {anatomy.scene.name!r}: "
             "move it out through the body wall"
         )
 
@@ -198,7 +193,7 @@ def start_direction(scene: Scene) -> FloatArray:
 
 
 def joint_servo(model: mujoco.MjModel, joints: tuple[str, ...]):
-    """A servo at rest that drives joints of a model, in the order given, within their limits."""
+    """Servo at rest for joints of a model, in the given order, with their limits."""
     pairs = [(position_actuator(model, name), speed_actuator(model, name)) for name in joints]
     position, speed = np.array(pairs, dtype=np.int64).T.copy()
     lower, upper = np.array([model.joint(name).range for name in joints]).T
@@ -208,7 +203,7 @@ def joint_servo(model: mujoco.MjModel, joints: tuple[str, ...]):
 def parked_place(anatomy: Anatomy) -> FloatArray:
     """Position of the tip before the first reset [m], (3,).
 
-    It is above the middle of the palpable face, or for a flap where a retraction begins.
+    It is above the middle of the palpable face, or at the start of a flap's retraction.
     """
     retract = anatomy.scene.retract
     if retract is not None and retract.flap is not None:

@@ -15,7 +15,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.arm.arm import Arm
 from surgsim_env.scene.palpable_surface import tangent_axes
 
-# Singular values below this share of the largest one do not take part of the null space; damping limits them.
+# Share of the largest singular value below which others leave the null space unchanged; damping limits them.
 RANK_SHARE = 1e-6
 DAMPING_LEAST = 1e-12
 # Largest joint motion in one Newton step of `solve_pose`, in seconds at the speed limits.
@@ -24,16 +24,16 @@ ITERATIONS = 100
 # Tolerances of a reached pose: [m], [rad].
 POSITION_TOLERANCE = 1e-9
 ANGLE_TOLERANCE = 1e-6
-# Shares of the way that `follow` tries, before it stands still.
+# Shares of the path tried by `follow` before it stands still.
 SHARES = (1.0, 0.5, 0.25, 0.125)
-# It turns the tip no faster than this [rad/s], in its first Newton steps; the others correct the position.
+# Largest turn rate of the tip in `follow` [rad/s], and its Newton steps with a turn; the others correct the position.
 TURN_RATE = 1.0
 TURNING_STEPS, NEWTON_STEPS = 2, 9
 
 
 @dataclass(frozen=True)
 class KinematicTask:
-    """A linear condition on joint steps (n,): jacobian (m, n) times the steps equals error (m,)."""
+    """Linear condition on joint steps (n,): jacobian (m, n) times the steps equals error (m,)."""
 
     jacobian: FloatArray
     error: FloatArray
@@ -41,14 +41,14 @@ class KinematicTask:
 
 @dataclass(frozen=True)
 class PoseSolution:
-    """The result of a search for joint values.
+    """Result of a search for joint values.
 
     Args:
         joints: values [rad or m], (n,).
         position_error: distance of the tip from its target [m].
         angle_error: angle between the tip's direction (or frame) and its target [rad]; 0 without a target.
         trocar_error: distance of the shaft's axis from the trocar [m].
-        reached: whether all three are within tolerance.
+        reached: True if all three are within tolerance.
     """
 
     joints: FloatArray
@@ -68,7 +68,7 @@ class Target:
 
 
 def prioritised_step(tasks: list[KinematicTask], lower: FloatArray, upper: FloatArray, scale: FloatArray) -> FloatArray:
-    """Joint steps within [lower, upper] (n,) for the tasks in order of priority; scale (n,) weighs the joints."""
+    """Joint steps within [lower, upper] (n,) for the tasks in order of priority; scale (n,) weights the joints."""
     step = np.zeros(len(scale))
     free = np.ones(len(scale), dtype=bool)
     while free.any():
@@ -87,9 +87,9 @@ def prioritised_step(tasks: list[KinematicTask], lower: FloatArray, upper: Float
 
 
 def _cascade(tasks: list[KinematicTask], scale: FloatArray) -> FloatArray:
-    """Steps of free joints: every task by damped least squares in the null space of those before it.
+    """Steps of free joints: each task by damped least squares in the null space of those before it.
 
-    The damping grows with the error (Sugihara 2011), lambda^2 = |e|^2 + DAMPING_LEAST, so that steps to far targets are
+    The damping grows with the error (Sugihara 2011), lambda^2 = |e|^2 + DAMPING_LEAST: steps to far targets are
     small and near ones converge at Newton's rate.
     """
     step = np.zeros(len(scale))
@@ -106,7 +106,7 @@ def _cascade(tasks: list[KinematicTask], scale: FloatArray) -> FloatArray:
 
 
 def tip_tasks(arm: Arm, joints: FloatArray, target: Target) -> list[KinematicTask]:
-    """Tasks of the trocar (if control keeps it), position and direction of the tip, at joint values (n,)."""
+    """Tasks of the trocar (unless the mechanism keeps it), position and direction of the tip, at joint values (n,)."""
     tasks = []
     if not arm.remote_centre_fixed:
         error, jacobian = arm.trocar_task(joints)
@@ -122,19 +122,19 @@ def tip_tasks(arm: Arm, joints: FloatArray, target: Target) -> list[KinematicTas
     return tasks
 
 
-def turn_towards(now: FloatArray, wanted: FloatArray) -> FloatArray:
+def turn_towards(now: FloatArray, goal: FloatArray) -> FloatArray:
     """Smallest rotation vector from one unit vector to another, (3,) [rad]."""
-    axis = np.cross(now, wanted)
-    sine, cosine = float(norm(axis)), float(matmul(now, wanted))
+    axis = np.cross(now, goal)
+    sine, cosine = float(norm(axis)), float(matmul(now, goal))
     if sine < 1e-12:
         # Opposite vectors: any perpendicular axis.
         return np.zeros(3) if cosine > 0.0 else np.pi * tangent_axes(now)[0]
     return axis / sine * arctan2(sine, cosine)
 
 
-def _turn_between(now: FloatArray, wanted: FloatArray) -> FloatArray:
+def _turn_between(now: FloatArray, goal: FloatArray) -> FloatArray:
     """Rotation vector from one frame (3, 3) to another, (3,) [rad]."""
-    turn = matmul(wanted, now.T)
+    turn = matmul(goal, now.T)
     axis = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     sine, cosine = float(norm(axis)), 0.5 * (float(np.trace(turn)) - 1.0)
     if sine < 1e-9 and cosine < 0.0:
@@ -173,14 +173,14 @@ def solve_pose(
     start: ArrayLike | None = None,
     iterations: int = ITERATIONS,
 ) -> PoseSolution:
-    """Joint values within the limits that bring the tip to a position [m], by damped Newton steps from a start (n,).
+    """Joint values within the limits for the tip at a position [m], by damped Newton steps from a start (n,).
 
     Args:
-        arm: whose tip.
+        arm: with the tip.
         position: of the tip [m], (3,).
         direction: of the tip (3,), or
         rotation: frame of the tip (3, 3).
-        start: initial joint values, home by default; other starts may converge where this one does not.
+        start: initial joint values, home by default; others may converge better.
         iterations: largest number of steps.
     """
     target = _target(position, direction, rotation)
@@ -194,14 +194,14 @@ def solve_pose(
         lower, upper = np.maximum(arm.lower - joints, -stride), np.minimum(arm.upper - joints, stride)
         step = prioritised_step(tip_tasks(arm, joints, target), lower, upper, arm.speed_limit)
         joints = (joints + step).clip(arm.lower, arm.upper)
-        found = _judge(arm, joints, target)
-        still = 0 if _worth(found) < 0.999 * _worth(best) else still + 1
-        best = min(best, found, key=_worth)
+        solution = _judge(arm, joints, target)
+        still = 0 if _total_error(solution) < 0.999 * _total_error(best) else still + 1
+        best = min(best, solution, key=_total_error)
     return best
 
 
-def _worth(solution: PoseSolution) -> float:
-    """Sum of the errors [m], where 1 rad of direction counts as 10 mm."""
+def _total_error(solution: PoseSolution) -> float:
+    """Sum of the errors [m]; 1 rad of direction counts as 10 mm."""
     return solution.trocar_error + solution.position_error + 0.01 * solution.angle_error
 
 
@@ -213,20 +213,21 @@ def reach_pose(
     rotation: ArrayLike | None = None,
     starts: int = 6,
 ) -> PoseSolution:
-    """The best `solve_pose` from home and, while none has reached the pose, from other fixed starts."""
+    """Best `solve_pose` from home and, until the pose is reached, from other fixed starts."""
     best = solve_pose(arm, position, direction=direction, rotation=rotation)
     shares = np.random.default_rng(0).random((starts, arm.joint_count))
     for share in shares:
         if best.reached:
             break
         start = arm.lower + (0.1 + 0.8 * share) * (arm.upper - arm.lower)
-        best = min(best, solve_pose(arm, position, direction=direction, rotation=rotation, start=start), key=_worth)
+        solution = solve_pose(arm, position, direction=direction, rotation=rotation, start=start)
+        best = min(best, solution, key=_total_error)
     return best
 
 
 @dataclass(frozen=True)
 class FollowStep:
-    """A step along a path: joint values at its end (n,), and whether limits shortened it."""
+    """Step along a path: joint values at its end (n,), and True if limits shortened it."""
 
     joints: FloatArray
     limited: bool
@@ -241,11 +242,11 @@ def follow(
     *,
     rotation: FloatArray | None = None,
 ) -> FollowStep:
-    """Joint values after `duration` [s] that bring the tip to a nearby position [m] and turn it as far as possible.
+    """Joint values after `duration` [s] for the tip at a nearby position [m], turned as far as possible.
 
     The tip turns to a direction (3,) or to a frame `rotation` (3, 3), within joint and speed limits. If the limits do
-    not permit the position, the tip goes an eighth to half of the way, or nowhere, and never leaves the line. A trocar
-    that control must keep has the highest priority.
+    not permit the position, the tip goes an eighth to half of the path, or stays, and never leaves the line. A trocar
+    without a fixed remote centre has the highest priority.
     """
     pose = arm.tip_pose(joints)
     now = pose.position
@@ -256,31 +257,31 @@ def follow(
     if rotation is not None:
         rotation = frame_towards(pose.rotation, rotation, TURN_RATE * duration)
     for share in SHARES:
-        found = _newton(arm, joints, Target(now + share * (position - now), direction, rotation), lower, upper)
-        if found is not None:
-            return FollowStep(found, share < 1.0)
+        solution = _newton(arm, joints, Target(now + share * (position - now), direction, rotation), lower, upper)
+        if solution is not None:
+            return FollowStep(solution, share < 1.0)
     return FollowStep(joints.copy(), True)
 
 
-def _turned(now: FloatArray, wanted: FloatArray, most: float) -> FloatArray:
-    """A unit vector turned towards another by an angle at most [rad], (3,)."""
-    turn = turn_towards(now, wanted)
+def _turned(now: FloatArray, goal: FloatArray, most: float) -> FloatArray:
+    """Unit vector turned towards another by at most an angle [rad], (3,)."""
+    turn = turn_towards(now, goal)
     angle = float(norm(turn))
     if angle <= most:
-        return wanted
+        return goal
     across = np.cross(turn / angle, now)
     return cos(most) * now + sin(most) * across
 
 
-def frame_towards(now: FloatArray, wanted: FloatArray, most: float) -> FloatArray:
-    """A frame turned towards another by an angle at most [rad], (3, 3)."""
-    turn = _turn_between(now, wanted)
+def frame_towards(now: FloatArray, goal: FloatArray, most: float) -> FloatArray:
+    """Frame turned towards another by at most an angle [rad], (3, 3)."""
+    turn = _turn_between(now, goal)
     angle = float(norm(turn))
-    return wanted if angle <= most else matmul(turn_matrix(turn * (most / angle)), now)
+    return goal if angle <= most else matmul(turn_matrix(turn * (most / angle)), now)
 
 
 def turn_matrix(turn: FloatArray) -> FloatArray:
-    """The rotation by a rotation vector [rad] (3,), as a matrix (3, 3): Rodrigues."""
+    """Rotation matrix (3, 3) of a rotation vector [rad] (3,), by Rodrigues' formula."""
     angle = float(norm(turn))
     if angle == 0.0:
         return np.eye(3)
@@ -290,7 +291,7 @@ def turn_matrix(turn: FloatArray) -> FloatArray:
 
 
 def _newton(arm: Arm, start: FloatArray, target: Target, lower: FloatArray, upper: FloatArray) -> FloatArray | None:
-    """A few Newton steps to a near target within limits; None if position or trocar is not reached."""
+    """Newton steps to a near target within limits; None if position or trocar is not reached."""
     joints, placed = start, Target(target.position)
     for iteration in range(NEWTON_STEPS):
         turning = iteration < TURNING_STEPS and (target.direction is not None or target.rotation is not None)

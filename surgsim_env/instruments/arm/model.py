@@ -1,4 +1,4 @@
-"""An arm's MuJoCo model: read from MJCF or URDF, checked against its description, placed at a port, compiled."""
+"""MuJoCo model of an arm: read from MJCF or URDF, checked against its description, placed at a port, compiled."""
 
 import math
 import warnings
@@ -19,12 +19,12 @@ from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
 from surgsim_env.scene.model import Port, frame_into
 
-# Groups of geoms: visual only, outer links for clearances; geoms of CONTACT_GROUP are felt by tissue.
+# Groups of geoms: visual only, and outer links for clearances; geoms of CONTACT_GROUP touch tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
 # Largest size of a model file [bytes]: chosen, MuJoCo would read a larger one for minutes.
 FILE_SIZE_MOST = 200_000_000
-# Of shapes that a description adds.
+# Colour of a description's added shapes.
 SHAPE_COLOUR = (0.72, 0.74, 0.78, 1.0)
 
 
@@ -36,12 +36,12 @@ def compile_arm(
     supports: Sequence[Support] = (),
     supports_move: bool = False,
 ) -> mujoco.MjModel:
-    """Compile the model of an arm alone with its trocar at a port; `tip_radius` [m] overrides that of the tip's ball.
+    """Compile the model of an arm alone with its trocar at a port; `tip_radius` [m] replaces that of the tip's ball.
 
     In MuJoCo geoms collide only with supports. Bodies are gravity-compensated; gravity is that of the model file.
 
     Raises:
-        ValueError: a missing or broken file, or a part of the description that is not in the model.
+        ValueError: a missing or broken file, or a part of the description without a match in the model.
     """
     where = f"arm {description.name!r}"
     try:
@@ -56,7 +56,7 @@ def compile_arm(
 
 
 def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> mujoco.MjSpec:
-    """The specification that `compile_arm` compiles, also for a model with several arms."""
+    """Specification of `compile_arm`, also for a model with several arms."""
     spec = read_model(description.folder / description.model, description.inertias, description.dropped_meshes)
     _add_shapes(spec, description)
     _check_parts(spec, description)
@@ -67,28 +67,28 @@ def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, 
 
 @contextmanager
 def warned(where: str) -> Iterator[None]:
-    """Within it, what MuJoCo warns of becomes a Python warning each, instead of lines that it prints and logs."""
-    said: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(said.append)
+    """Turn MuJoCo's warnings within the block into Python warnings, in place of printed and logged lines."""
+    messages: list[str] = []
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(messages.append)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(before)
-        for text in dict.fromkeys(said):
+        mujoco.set_mju_user_warning(handler)
+        for text in dict.fromkeys(messages):
             warnings.warn(f"{where}: MuJoCo: {' '.join(text.split())}", stacklevel=1)
 
 
 def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes: Sequence[str] = ()) -> mujoco.MjSpec:
-    """MuJoCo's specification of an MJCF or URDF file.
+    """Read MuJoCo's specification of an MJCF or URDF file.
 
     Args:
         path: of the file.
         inertias: of links of a URDF file, in place of its own.
-        dropped_meshes: file names of meshes of a URDF file that are left out.
+        dropped_meshes: file names of left out meshes of a URDF file.
 
     Raises:
-        ValueError: a file that is missing or wrong; entries for a URDF with an MJCF.
+        ValueError: a missing or wrong file; entries for a URDF with an MJCF.
     """
     root = read_xml(path)
     if root.tag == "robot":
@@ -104,10 +104,10 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
 
 
 def read_xml(path: Path) -> ElementTree.Element:
-    """The root element of a model file.
+    """Read the root element of a model file.
 
     Raises:
-        ValueError: a file that cannot be read, is larger than FILE_SIZE_MOST or is no XML.
+        ValueError: an unreadable file, one larger than FILE_SIZE_MOST, or one without valid XML.
     """
     try:
         size = path.stat().st_size
@@ -121,13 +121,13 @@ def read_xml(path: Path) -> ElementTree.Element:
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
-    """Check that every part of the description is in the model and of a permitted kind."""
+    """Check that all parts of the description are in the model and of a permitted kind."""
     joints = {joint.name: joint for joint in spec.joints}
     for name in (*description.joints, *description.jaw):
-        what = "jaw joint" if name in description.jaw else "joint"
-        _require_part(what, name, joints)
+        kind = "jaw joint" if name in description.jaw else "joint"
+        _require_part(kind, name, joints)
         if joints[name].type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-            raise ValueError(f"{what} {name!r} is neither a hinge nor a slide; give single joints")
+            raise ValueError(f"{kind} {name!r} is neither a hinge nor a slide; give single joints")
     for name in description.limits:
         _require_part("limits of joint", name, joints)
     for name, joint in joints.items():
@@ -136,14 +136,14 @@ def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
     geoms = {geom.name: geom for geom in spec.geoms}
     tip, trocar = description.tip, description.trocar
     for name in (*description.contact, *description.links, *([tip.ball] if tip.ball else [])):
-        what = "contact geom" if name in description.contact else "geom"
-        _require_part(what, name, geoms)
-        round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        kind = "contact geom" if name in description.contact else "geom"
+        _require_part(kind, name, geoms)
+        rounded = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
         pad = name in description.contact and geoms[name].type == mujoco.mjtGeom.mjGEOM_BOX
-        if geoms[name].type not in round_ones and not pad:
-            kind = geoms[name].type.name.removeprefix("mjGEOM_").lower()
+        if geoms[name].type not in rounded and not pad:
+            shape = geoms[name].type.name.removeprefix("mjGEOM_").lower()
             raise ValueError(
-                f"{what} {name!r} is a {kind}; only spheres and capsules can be felt, and boxes as contact: draw one "
+                f"{kind} {name!r} is a {shape}; only spheres and capsules can be felt, and boxes as contact: draw one "
                 "around it"
             )
     bodies = {body.name: body for body in spec.bodies}
@@ -154,11 +154,11 @@ def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
         _require_part("tip body", tip.body, bodies)
 
 
-def _require_part(what: str, name: str, known: Iterable[str]) -> None:
+def _require_part(kind: str, name: str, known: Iterable[str]) -> None:
     names = sorted(item for item in known if item)
     if name not in names:
         listed = ", ".join(names) if names else "none with a name"
-        raise ValueError(f"{what} {name!r} is not in the model{nearest(name, names)}; the model has {listed}")
+        raise ValueError(f"{kind} {name!r} is not in the model{nearest(name, names)}; the model has {listed}")
 
 
 def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: float | None, timestep: float) -> None:
@@ -182,7 +182,7 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         spec.body(arm.tip.body).add_site(name=TIP_SITE, pos=arm.tip.offset, size=[0.001, 0.001, 0.001])
     for name, limits in arm.limits.items():
         joint = spec.joint(name)
-        if joint is not None:  # None for one that is held
+        if joint is not None:  # None for a held joint
             joint.range = np.array(limits) / _angle_unit(spec, joint)
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
     if arm.control.mode == "servo":
@@ -191,11 +191,11 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
 
 
 def _add_shapes(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
-    """Add the description's own spheres and capsules, without mass; those of links are not seen in pictures."""
-    bodies, taken = {body.name: body for body in spec.bodies}, {geom.name for geom in spec.geoms}
+    """Add the description's own spheres and capsules, without mass; those of links are invisible."""
+    bodies, names = {body.name: body for body in spec.bodies}, {geom.name for geom in spec.geoms}
     for shape in arm.shapes:
         _require_part(f"body of shape {shape.name!r},", shape.body, bodies)
-        if shape.name in taken:
+        if shape.name in names:
             raise ValueError(f"shapes: the model has a geom {shape.name!r} already: rename the shape")
         colour = (*SHAPE_COLOUR[:3], 0.0) if shape.name in arm.links else SHAPE_COLOUR
         geom = bodies[shape.body].add_geom(name=shape.name, mass=0.0, rgba=colour)
@@ -207,41 +207,41 @@ def _add_shapes(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
 
 
 def hold_joints(spec: mujoco.MjSpec, held: Mapping[str, float]) -> None:
-    """Fix joints at values [rad or m]: take them out, with what couples and drives them, and place their bodies.
+    """Fix joints at values [rad or m]: remove them with their couplings and actuators, and place their bodies.
 
     Raises:
-        ValueError: a joint that is not there or whose body's place cannot be changed.
+        ValueError: an unknown joint, or a joint with a body that cannot be moved.
     """
     joints = {joint.name: joint for joint in spec.joints}
     for name, value in held.items():
         _require_part("held joint", name, joints)
         joint, body = joints[name], joints[name].parent
-        way = value - joint.ref * _angle_unit(spec, joint)
-        if abs(way) > 1e-12:
+        offset = value - joint.ref * _angle_unit(spec, joint)
+        if abs(offset) > 1e-12:
             turned = body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
             if body.frame is not None or turned or len(body.joints) > 1:
                 raise ValueError(
                     f"held joint {name!r} is at {value:g}, but its body {body.name!r} is in a <frame>, turned by other "
                     "angles than a quaternion, or has several joints: hold it at its value in the model, or change that"
                 )
-            _move_body(body, joint, way)
+            _move_body(body, joint, offset)
         spec.delete(joint)
-    coupled = [one for one in spec.equalities if not held.keys().isdisjoint((one.name1, one.name2))]
-    driven = [one for one in spec.actuators if one.target in held]
+    coupled = [equality for equality in spec.equalities if not held.keys().isdisjoint((equality.name1, equality.name2))]
+    driven = [actuator for actuator in spec.actuators if actuator.target in held]
     for part in (*coupled, *driven):
         spec.delete(part)
 
 
-def _move_body(body: Any, joint: Any, way: float) -> None:
-    """Place a body as if its joint were moved by a way [rad or m] from where the model has it."""
+def _move_body(body: Any, joint: Any, offset: float) -> None:
+    """Place a body as if its joint were displaced by an offset [rad or m] from the model's value."""
     axis = np.array(joint.axis) / norm(joint.axis)
     turned = np.zeros(3)
     if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
-        mujoco.mju_rotVecQuat(turned, way * axis, body.quat)
+        mujoco.mju_rotVecQuat(turned, offset * axis, body.quat)
         body.pos = body.pos + turned
         return
     turn, quaternion, anchor = np.zeros(4), np.zeros(4), np.zeros(3)
-    mujoco.mju_axisAngle2Quat(turn, axis, way)
+    mujoco.mju_axisAngle2Quat(turn, axis, offset)
     mujoco.mju_rotVecQuat(anchor, np.array(joint.pos), turn)
     mujoco.mju_rotVecQuat(turned, np.array(joint.pos) - anchor, body.quat)
     mujoco.mju_mulQuat(quaternion, body.quat, turn)
@@ -279,7 +279,7 @@ def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
 
 
 def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
-    """Move everything in the model's world so that its trocar coincides with the port."""
+    """Move all parts of the model's world so that its trocar coincides with the port."""
     trocar = arm.trocar
     rotation = matmul(port.rotation, frame_into(np.array(trocar.into)).T)
     quaternion = np.zeros(4)
@@ -293,7 +293,7 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
 
 
 def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:
-    """Check that every driven joint has limits around its home position, and a position actuator."""
+    """Check that all driven joints have limits around their home values, and position actuators."""
     for name in (*arm.joints, *arm.jaw):
         joint = model.joint(name)
         lower, upper = joint.range
@@ -335,7 +335,7 @@ def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
 
 
 def _is_servo(model: mujoco.MjModel, actuator: int, bias: int) -> bool:
-    """Whether an actuator's force is exactly gain (ctrl - x), where x is position (bias 1) or speed (bias 2)."""
+    """True if an actuator's force is exactly gain (ctrl - x), with x the position (bias 1) or speed (bias 2)."""
     gain, biases = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
     plain = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE and model.actuator_gear[actuator, 0] == 1.0
     simple = plain and gain > 0.0

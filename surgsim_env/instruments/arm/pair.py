@@ -1,4 +1,4 @@
-"""Two arms in one model, in contact with the organ, its supports and each other; the left one grasps."""
+"""Two arms in one model, in contact with the organ, its supports and each other; the left arm grasps."""
 
 import math
 from itertools import product
@@ -25,16 +25,16 @@ from surgsim_env.scene.load import pair_names
 from surgsim_env.scene.model import Scene
 
 SIDES = ("left", "right")
-# Contact mask bits: geoms of one arm collide with those of the other, not with their own (and with supports).
+# Contact mask bits: geoms of an arm collide with those of the other arm and supports, not with their own arm's.
 ARM_BITS = {"left": 4, "right": 8}
 # Contact between arms is soft: critically damped, with a time constant of five haptic steps [s].
 CONTACT_SOFTNESS = (0.005, 1.0)
-# The right arm on a support: 1240 N/m at its ball, so that 0.1 N is 0.08 mm, more than one control step moves it. As
+# The right arm on a support: 1240 N/m at its ball, 0.08 mm for 0.1 N, more than its motion in a control step. As
 # MuJoCo's contact stiffness is proportional to the tool's mass (`SOLREF`), this is 1 / 6.5 of that of others.
 TOUCH_SOFTNESS = (SOLREF[0] / 6.5, SOLREF[1] / math.sqrt(6.5))
 # Half the distance between the tips before the first reset [m].
 PARKED_ASIDE = 0.025
-# Largest distance between the arms that is measured [m].
+# Largest measured distance between the arms [m].
 DISTANCE_MOST = 0.05
 
 
@@ -62,15 +62,15 @@ class Pair(SteeredArms):
                 f"scene {scene.name!r} has {len(scene.ports)} [[ports]]; {scene.instrument.model!r} needs two, the "
                 "left arm's first: add them, or take a scene that has them, such as 'lobe'"
             )
-        made = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
+        arms = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
         with warned(f"scene {scene.name!r}"):
-            model = _compile(made, scene)
-        super().__init__(model, lower, upper, model.site(f"left_{made['left'].description.tip.site}").id)
-        driven = [f"{side}_{name}" for side, arm in made.items() for name in arm.joints]
-        fingers = {side: [f"{side}_{name}" for name in arm.description.jaw] for side, arm in made.items()}
+            model = _compile(arms, scene)
+        super().__init__(model, lower, upper, model.site(f"left_{arms['left'].description.tip.site}").id)
+        driven = [f"{side}_{name}" for side, arm in arms.items() for name in arm.joints]
+        fingers = {side: [f"{side}_{name}" for name in arm.description.jaw] for side, arm in arms.items()}
         self.servo = joint_servo(model, (*driven, *fingers["left"], *fingers["right"]))
         self.arms: dict[str, SteeredArm] = {}
-        for side, arm in made.items():
+        for side, arm in arms.items():
             places = np.array([index for index, name in enumerate(driven) if name.startswith(side)])
             jaw = None
             if fingers[side]:
@@ -85,7 +85,7 @@ class Pair(SteeredArms):
                 jaw=jaw,
                 prefix=f"{side}_",
             )
-        jaws = [one.jaw for one in self.arms.values() if one.jaw is not None]
+        jaws = [arm.jaw for arm in self.arms.values() if arm.jaw is not None]
         self.jaw = jaws[0] if jaws else None
         self.jaws = np.array([jaw.tools for jaw in jaws], dtype=np.int32).reshape(-1, 2)
         self._geoms_of = {side: _outside(model, side) for side in SIDES}
@@ -97,7 +97,7 @@ class Pair(SteeredArms):
 
     @property
     def distance(self) -> float:
-        """Smallest distance between the arms' outer shapes, at most DISTANCE_MOST [m]; negative when they press."""
+        """Smallest distance between the arms' outer shapes, at most DISTANCE_MOST [m]; negative under pressure."""
         least, ends = DISTANCE_MOST, np.zeros(6)
         for left in self._geoms_of["left"]:
             for right in self._geoms_of["right"]:
@@ -138,13 +138,13 @@ class Pair(SteeredArms):
         """Size of the force between an arm and one of the scene's supports in the last haptic step [N]."""
         return self._contact_force(self._geoms_of[side], np.array([self.model.geom(SUPPORT_PREFIX + support).id]))
 
-    def _contact_force(self, some: IntArray, others: IntArray) -> float:
+    def _contact_force(self, geoms: IntArray, others: IntArray) -> float:
         """Size of the sum of MuJoCo's contact forces between two sets of geoms [N]."""
         total, force = np.zeros(3), np.zeros(6)
         for index in range(self.data.ncon):
             contact = self.data.contact[index]
             first, second = contact.geom
-            sign = 1.0 if first in some and second in others else -1.0 if first in others and second in some else 0.0
+            sign = 1.0 if first in geoms and second in others else -1.0 if first in others and second in geoms else 0.0
             if sign:
                 mujoco.mj_contactForce(self.model, self.data, index, force)
                 total += sign * matmul(contact.frame.reshape(3, 3).T, force[:3])
@@ -155,7 +155,7 @@ class Pair(SteeredArms):
 
 
 def _compile(arms: dict[str, Arm], scene: Scene) -> mujoco.MjModel:
-    """Compile both arms and the supports into one model; parts of an arm have its side as a prefix."""
+    """Compile both arms and the supports into one model; the names of an arm's parts have its side as a prefix."""
     spec, timestep = mujoco.MjSpec(), scene.timing.haptic_step
     for side, arm in arms.items():
         child = arm_spec(arm.description, arm.port, scene.instrument.tip_radius, timestep)

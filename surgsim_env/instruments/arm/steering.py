@@ -1,4 +1,4 @@
-"""Control of one arm of an instrument, alone or one of two: tip velocity to joint speeds by inverse kinematics."""
+"""Control of an instrument's arm: tip velocity to joint speeds by inverse kinematics."""
 
 import math
 
@@ -19,28 +19,28 @@ from surgsim_env.instruments.arm.inverse_kinematics import (
 )
 from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
 
-# The tip has reached a place within this distance [m]; its direction is as the joints allow.
+# Tolerance of a reached position [m]; the direction is as the joints allow.
 PLACE_TOLERANCE = 1e-6
-# The commanded orientation of a tip with a jaw may be ahead of the actual one by at most this angle [rad].
+# Largest angle of the commanded orientation of a tip with a jaw ahead of the actual one [rad].
 TURN_AHEAD = 0.2
 
 
 class SteeredArm:
-    """An arm within an instrument's model, whose tip follows a commanded velocity and direction.
+    """Arm within an instrument's model, with commands of the tip's velocity and direction.
 
-    Once per control step `command_velocity` computes the joint values that bring the tip to its target at the end of
-    the step (`inverse_kinematics.follow`) and commands the constant joint speeds that lead there; the servo integrates
-    them at haptic rate. Joint targets continue from the last ones, so that the path does not drift.
+    Once per control step `command_velocity` computes the joint values for the tip's target at the end of the step
+    (`inverse_kinematics.follow`) and commands constant joint speeds towards them; the servo integrates them at haptic
+    rate. Joint targets continue from the last ones, so the path does not drift.
 
-    For a tip without pads only the direction is controlled, and it may roll. For a jaw with pads the whole frame is, so
-    that the pads face each other vertically.
+    For a tip without pads only the direction is controlled, and it may roll. For a jaw with pads the whole frame is
+    controlled, with the pads facing each other vertically.
 
     Fields:
         arm: its kinematics, compiled alone
-        lower, upper: the box that the tip may move in [m]                       (3,)
+        lower, upper: the box of the tip [m]                                     (3,)
         jaw: None without one
-        wanted: commanded direction of the tip (3,), or its frame if a jaw has pads (3, 3)
-        short: whether the box, a joint's limit or its speed limit stopped the commanded motion
+        goal: commanded direction of the tip (3,), or its frame if a jaw has pads (3, 3)
+        short: True if the box, a joint's limit or its speed limit stopped the commanded motion
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class SteeredArm:
             instrument: with a servo for the arm's joints.
             places: indices of the arm's joints in the servo, (n,).
             direction: of the tip at the start, (3,).
-            control_step: for which a commanded velocity is valid [s].
+            control_step: duration of a commanded velocity [s].
             jaw: of the arm.
             prefix: of the names of the arm's parts in the instrument's model.
         """
@@ -78,12 +78,12 @@ class SteeredArm:
             frame = matmul(frame_along(direction), _jaw_frame(arm).T)
             half_turn = turn_matrix(np.pi * self._starts[0])
             self._starts = [frame, matmul(half_turn, frame)]
-        self.wanted = self._starts[0].copy()
+        self.goal = self._starts[0].copy()
         self.short = False
 
     @property
     def tip_position(self) -> FloatArray:
-        """The tip [m], shape (3,): centre of the ball, or the middle between the pads."""
+        """Position of the tip [m], shape (3,): centre of the ball, or middle between the pads."""
         return self._instrument.data.site_xpos[self._tip].copy()
 
     @property
@@ -110,12 +110,12 @@ class SteeredArm:
 
     @property
     def limited(self) -> bool:
-        """Whether the box, a joint's limit or its speed limit stopped the commanded motion of the tip."""
+        """True if the box, a joint's limit or its speed limit stopped the commanded motion of the tip."""
         return self.short or bool(self._instrument.servo.limited[self._places].any())
 
     @property
     def where(self) -> str:
-        """The arm's name and place in error messages."""
+        """Name and port of the arm in error messages."""
         return f"arm {self.arm.description.name!r} at its port {millimetres(np.array(self.arm.port.point))}"
 
     def place(self, position: FloatArray) -> None:
@@ -126,19 +126,19 @@ class SteeredArm:
         Raises:
             ValueError: the tip does not reach the position (gives the distance and the port).
         """
-        found, self.wanted = self._reach(position)
-        if not placed(found):
-            raise ValueError(f"{self.where} cannot put its tip at {millimetres(position)}: {missing(found)}")
+        solution, self.goal = self._reach(position)
+        if not placed(solution):
+            raise ValueError(f"{self.where} cannot put its tip at {millimetres(position)}: {missing(solution)}")
         self.short = False
         data, servo = self._instrument.data, self._instrument.servo
-        data.qpos[self._qpos] = found.joints
-        data.ctrl[servo.position[self._places]] = found.joints
+        data.qpos[self._qpos] = solution.joints
+        data.ctrl[servo.position[self._places]] = solution.joints
         servo.command[self._places] = 0.0
         if self.jaw is not None:
             self.jaw.rest()
 
     def reach(self, position: FloatArray) -> PoseSolution:
-        """Joint values that reach a position [m], with the tip as close to the start direction as possible."""
+        """Joint values for a position [m], with the tip as close to the start direction as possible."""
         return self._reach(position)[0]
 
     def command_velocity(self, velocity: FloatArray, turning: FloatArray) -> None:
@@ -154,20 +154,20 @@ class SteeredArm:
             return
         pose = self.arm.tip_pose(joints)
         if np.any(turning):
-            self._turn_wanted(turning * duration, pose.rotation)
-        wanted = pose.position + np.asarray(velocity, dtype=np.float64) * duration
-        held = np.clip(wanted, self.lower, self.upper)
+            self._turn_goal(turning * duration, pose.rotation)
+        target = pose.position + np.asarray(velocity, dtype=np.float64) * duration
+        held = np.clip(target, self.lower, self.upper)
         if not np.any(velocity) and self._points_well(joints, pose.rotation):
             self.short = False
             servo.command[self._places] = 0.0
             return
-        direction, frame = (None, self.wanted) if self.wanted.ndim == 2 else (self.wanted, None)
+        direction, frame = (None, self.goal) if self.goal.ndim == 2 else (self.goal, None)
         step = follow(self.arm, joints, held, direction, duration, rotation=frame)
-        self.short = step.limited or bool((held != wanted).any())
+        self.short = step.limited or bool((held != target).any())
         servo.command[self._places] = (step.joints - joints) / duration
 
     def command_jaw(self, target: float) -> None:
-        """Command the jaw to a target from -1 (closed) to 1 (open), which it approaches at limited speed and holds.
+        """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.
 
         Raises:
             ValueError: no jaw, or a target outside that range.
@@ -177,39 +177,41 @@ class SteeredArm:
         self.jaw.command(target)
 
     def get_state(self) -> FloatArray:
-        """The state beyond MuJoCo's and the servo's, `wanted` and `short`, as one vector."""
-        return np.append(self.wanted.ravel(), float(self.short))
+        """State beyond MuJoCo's and the servo's, `goal` and `short`, as a vector."""
+        return np.append(self.goal.ravel(), float(self.short))
 
     def set_state(self, state: FloatArray) -> None:
         """Restore a state from `get_state`, to the bit."""
-        self.wanted = state[:-1].reshape(self.wanted.shape).copy()
+        self.goal = state[:-1].reshape(self.goal.shape).copy()
         self.short = bool(state[-1])
 
-    def _turn_wanted(self, turn: FloatArray, rotation: FloatArray) -> None:
-        if self.wanted.ndim == 2:
-            near = frame_towards(rotation, self.wanted, TURN_AHEAD)
+    def _turn_goal(self, turn: FloatArray, rotation: FloatArray) -> None:
+        if self.goal.ndim == 2:
+            near = frame_towards(rotation, self.goal, TURN_AHEAD)
             left, _, right = svd(matmul(turn_matrix(turn), near))
-            self.wanted = matmul(left, right)
+            self.goal = matmul(left, right)
         else:
             quaternion, turned, angle = np.zeros(4), np.zeros(3), float(norm(turn))
             mujoco.mju_axisAngle2Quat(quaternion, turn / angle, angle)
-            mujoco.mju_rotVecQuat(turned, self.wanted, quaternion)
-            self.wanted = turned / norm(turned)
+            mujoco.mju_rotVecQuat(turned, self.goal, quaternion)
+            self.goal = turned / norm(turned)
 
     def _points_well(self, joints: FloatArray, rotation: FloatArray) -> bool:
-        if self.wanted.ndim == 2:
-            return bool(np.abs(rotation - self.wanted).max() < 1e-6)
-        return bool(norm(turn_towards(self.arm.tip_direction(joints), self.wanted)) < 1e-6)
+        if self.goal.ndim == 2:
+            return bool(np.abs(rotation - self.goal).max() < 1e-6)
+        return bool(norm(turn_towards(self.arm.tip_direction(joints), self.goal)) < 1e-6)
 
     def _reach(self, position: FloatArray) -> tuple[PoseSolution, FloatArray]:
-        """Joint values that reach a position [m], and the direction or frame that was sought."""
-        found: list[tuple[PoseSolution, FloatArray]] = []
+        """Joint values for a position [m], and the chosen direction or frame of the start."""
+        solutions: list[tuple[PoseSolution, FloatArray]] = []
         for start in self._starts:
-            given = {"rotation": start} if start.ndim == 2 else {"direction": start}
-            found.append((reach_pose(self.arm, position, starts=2, **given), start.copy()))
+            goal = {"rotation": start} if start.ndim == 2 else {"direction": start}
+            solutions.append((reach_pose(self.arm, position, starts=2, **goal), start.copy()))
         # Of equal angles the joints nearest to home, as shares of their ranges.
         home, span = self.arm.home, self.arm.upper - self.arm.lower
-        best = min(found, key=lambda one: (round(one[0].angle_error, 6), (np.abs(one[0].joints - home) / span).sum()))
+        best = min(
+            solutions, key=lambda pair: (round(pair[0].angle_error, 6), (np.abs(pair[0].joints - home) / span).sum())
+        )
         if placed(best[0]):
             return best
         return reach_pose(self.arm, position, starts=4), best[1]
@@ -229,17 +231,17 @@ def _jaw_frame(arm: Arm) -> FloatArray:
     return matmul(rotation.T, np.stack([np.cross(y, z), y, z], axis=1))
 
 
-def placed(found: PoseSolution) -> bool:
-    """Whether joint values bring the tip to its place and the shaft through the trocar."""
-    return found.position_error <= PLACE_TOLERANCE and found.trocar_error <= PLACE_TOLERANCE
+def placed(solution: PoseSolution) -> bool:
+    """True if the tip is at its position and the shaft in the trocar."""
+    return solution.position_error <= PLACE_TOLERANCE and solution.trocar_error <= PLACE_TOLERANCE
 
 
-def missing(found: PoseSolution) -> str:
-    """The remaining errors of joint values, for an error message."""
-    away, off = found.position_error * 1e3, found.trocar_error * 1e3
+def missing(solution: PoseSolution) -> str:
+    """Remaining errors of joint values, for an error message."""
+    away, off = solution.position_error * 1e3, solution.trocar_error * 1e3
     return f"its tip stays {away:.3f} mm away, its shaft {off:.3f} mm off the trocar"
 
 
 def millimetres(point: FloatArray) -> str:
-    """A position in millimetres, for a message."""
+    """Position in millimetres, for a message."""
     return "(" + ", ".join(f"{value * 1e3:.1f}" for value in point) + ") mm"

@@ -8,15 +8,17 @@ import pytest
 from msdm_core.errors import OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS, STRAIN_LEAST, node_law
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
-from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_NONE, KEPT_NAMES, ContactLaw, OrganModel, OrganState
+from msdm_core.kernels.vector_kernels import GROUP
 from msdm_core.lanes.lanes import get_lane, lane_responses, lanes_of, put_lane, stack_organs, stack_shapes
 from msdm_core.material.regions import Damping, Lesion, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.meshing.lattice_meshing import box_mesh
-from msdm_core.organ.compile import OrganSpec, blank_state, compile_organ, relax_arms, rest_state
+from msdm_core.organ.compile import OrganSpec, compile_organ, relax_arms, rest_state
 from msdm_core.organ.measure import kinetic_energy, potential_energy, spring_energies, spring_tensions
 from msdm_core.organ.stability import HELD_TANGENT, stable_dt, steep_sweeps
+from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance, advance_organ, round_shapes
 from tests.core.lanes.abreast import advance_lanes
 from tests.core.measures import angular_momentum, arm_energy, internal_forces
@@ -172,7 +174,7 @@ def test_equilibrium_is_that_without_arms():
 
 
 def saved(state: OrganState) -> dict[str, np.ndarray]:
-    return {name: getattr(state, name).copy() for name in OrganState._fields if name not in SCRATCH_FIELDS}
+    return {name: getattr(state, name).copy() for name in KEPT_NAMES}
 
 
 def test_a_restored_state_goes_on_to_the_bit():
@@ -327,14 +329,15 @@ def test_steep_springs_do_not_limit_the_step(cap: float, stretch: float, relaxat
 def held(model: OrganModel, state: OrganState, sweeps: int, dt: float) -> FloatArray:
     """Matrix of `hold_steep` on velocities, in coordinates v sqrt(m), (3 n_node, 3 n_node)."""
     scale = np.sqrt(model.node_mass)[:, None]
-    springs, columns = np.arange(len(model.spring_nodes), dtype=np.int32), []
+    tets, springs, columns = len(model.tet_nodes), len(model.spring_nodes), []
+    groups = np.r_[0:tets:GROUP, tets:springs:GROUP].astype(np.int32)
+    swept = model._replace(steep_sweeps=sweeps)
     for unit in np.eye(state.node_velocity.size):
         velocity, force = unit.reshape(-1, 3) / scale, np.zeros_like(state.node_velocity)
-        hold_steep(
-            (), state.node_position, velocity, force, model.node_inverse_mass, model.spring_nodes,
-            model.spring_stiffness, state.node_steepness, model.spring_gain, model.relaxes, len(model.tet_nodes),
-            springs, len(springs), 1, sweeps, sweeps, state.steep_places, state.steep_rows, state.steep_speed, dt,
-        )  # fmt: skip
+        rows = state._replace(
+            row_position=state.node_position, row_velocity=velocity, row_force=force, steep_springs=groups
+        )
+        hold_steep((), swept, rows, len(groups), sweeps, dt)
         columns.append(((velocity + dt * model.node_inverse_mass[:, None] * force) * scale).ravel())
     return np.array(columns).T
 

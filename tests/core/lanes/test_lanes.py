@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from msdm_core.errors import OrganError
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
+    KEPT_NAMES,
     LANE_EMPTY,
-    SCRATCH_FIELDS,
     ContactLaw,
     ContactShapes,
     LaneModel,
@@ -39,7 +39,7 @@ SUBSTEP, SUBSTEPS = 5e-5, 5
 
 def same(a: OrganState, b: OrganState) -> list[str]:
     """The fields in which two states differ in any bit (a number that is not one equals itself)."""
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in OrganState._fields if name not in SCRATCH_FIELDS}
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in KEPT_NAMES}
     return [name for name, (left, right) in pairs.items() if left.tobytes() != right.tobytes()]
 
 

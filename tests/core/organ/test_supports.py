@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msdm_core.errors import OrganDivergedError, OrganError
-from msdm_core.kernels.structure_kernels import FAULT_NONE, SCRATCH_FIELDS, ContactLaw, OrganModel, OrganState
+from msdm_core.kernels.structure_kernels import FAULT_NONE, KEPT_NAMES, ContactLaw, OrganModel, OrganState
 from msdm_core.lanes.lanes import get_lane, stack_organs, stack_shapes
 from msdm_core.organ import compile as organ_compile
 from msdm_core.organ.compile import rest_state
@@ -162,7 +162,7 @@ def test_supports_are_the_only_force_from_outside():
 def test_a_push_that_ends_leaves_the_block_where_friction_holds_it():
     """Stick and slip are remembered: the same state, copied without its stretch, goes another way."""
     model, state = on_incline(np.radians(20.0), 0.4)
-    kept = {name: getattr(state, name).copy() for name in OrganState._fields if name not in SCRATCH_FIELDS}
+    kept = {name: getattr(state, name).copy() for name in KEPT_NAMES}
     run(model, state, 0.05)
     again = rest_state(model._replace(gravity=oracle.frozen(np.zeros(3))))._replace(**kept)
     run(model, again, 0.05)
@@ -215,7 +215,7 @@ def test_the_same_organ_settles_once(monkeypatch):
     first = rest_state(free_block(FLOOR))
     again = rest_state(free_block(FLOOR))
     assert len(calls) == 1
-    for name in (name for name in OrganState._fields if name not in SCRATCH_FIELDS):
+    for name in KEPT_NAMES:
         assert getattr(again, name).tobytes() == getattr(first, name).tobytes(), name
     assert rest_state(free_block(FLOOR), shape_count=3).node_position.tobytes() == first.node_position.tobytes()
     assert len(calls) == 1
@@ -253,7 +253,7 @@ def test_lanes_rest_as_their_organs_do_alone():
     for lane, single in enumerate(alone):
         assert (np.abs(single.support_stretch).max(axis=(0, 2)) > 0.0).all(), "both are touched"
         other = get_lane(state, lane)
-        for name in (name for name in OrganState._fields if name not in SCRATCH_FIELDS):
+        for name in KEPT_NAMES:
             assert getattr(other, name).tobytes() == getattr(single, name).tobytes(), f"lane {lane}: {name}"
 
 

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.scores import (
+from surgsim_apps.scoring.figures import (
     ERROR_LINE,
-    FOUND_SHARE,
     MapScore,
     PalpationRecord,
     press_errors,
     presses_to_line,
     score,
 )
+from surgsim_env.palpation import FOUND_SHARE
 
 SIDE = 0.04  # of the square that lesions are drawn in [m]
 BUDGET = 5

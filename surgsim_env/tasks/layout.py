@@ -1,0 +1,196 @@
+"""Entries of a task's actions and observations: slices by name, bounds and scales, from its declaration."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.arithmetic import matmul
+from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.tasks.declaration import Channel, Command
+from surgsim_env.tasks.task import Task
+
+
+class TaskLayout:
+    """Layout of a task's actions and observations.
+
+    Fields:
+        action_slices: entries of an action, by the command's name
+        observation_slices: entries of an observation, by the channel's name
+        observed: channels of an observation, with their sizes
+    """
+
+    def __init__(self, task: Task) -> None:
+        """Lay out the commands and channels of a task; those of size 0 are left out."""
+        self._task = task
+        self.action_slices = _slices((command.name, _size(command, task)) for command in task.commands)
+        self._commands = {command.name: command for command in task.commands if command.name in self.action_slices}
+        sized = ((channel, _size(channel, task)) for channel in task.channels)
+        self.observed: tuple[tuple[Channel, int], ...] = tuple((channel, size) for channel, size in sized if size)
+        self.observation_slices = _slices((channel.name, size) for channel, size in self.observed)
+
+    # ---- actions -----------------------------------------------------------------------------------------------
+
+    @property
+    def action_size(self) -> int:
+        """Entries of an action, each in [-1, 1]."""
+        return max(part.stop for part in self.action_slices.values())
+
+    @property
+    def speed_limit(self) -> float:
+        """The largest tip velocity that an action can command along an axis [m/s]."""
+        return self._commands["velocity"].scale
+
+    def action(self, velocity: FloatArray | None = None, **commands: Any) -> FloatArray:
+        """The action of commands in SI units and on the world's axes, shape (action_size,).
+
+        Those left out, or None, have their default, else 0.
+
+        Raises:
+            TypeError: a command that the task does not have (lists those that it has).
+        """
+        given = {"velocity": velocity, **commands}
+        for name, value in given.items():
+            if value is not None and name not in self._commands:
+                raise TypeError(
+                    f"{type(self._task).__name__} has no command {name!r}; its commands are "
+                    f"{', '.join(self.action_slices)}"
+                )
+        values = np.zeros(self.action_size)
+        for name, command in self._commands.items():
+            value = given.get(name)
+            if value is None and command.default is not None:
+                value = command.default(self._task)
+            elif value is not None and (axes := _axes(command, self._task)) is not None:
+                value = matmul(np.asarray(value, dtype=np.float64), axes.T)
+            if value is not None:
+                values[self.action_slices[name]] = np.asarray(value, dtype=np.float64) / command.scale
+        return values
+
+    def commands(self, action: FloatArray) -> dict[str, FloatArray]:
+        """Commands of an action (action_size,) in SI units and on the world's axes, by name, shape (size,) each."""
+        values = {}
+        for name, command in self._commands.items():
+            value = np.asarray(action[self.action_slices[name]], dtype=np.float64) * command.scale
+            axes = _axes(command, self._task)
+            values[name] = value if axes is None else matmul(value, axes)
+        return values
+
+    # ---- observations ------------------------------------------------------------------------------------------
+
+    @property
+    def declared(self) -> dict[str, tuple[int, str]]:
+        """Size and scale, as the documentation shows it, of each channel that is observed, by its name."""
+        return {channel.name: (size, channel.scale_shown) for channel, size in self.observed}
+
+    @property
+    def force_entries(self) -> list[int]:
+        """Indices of the observation that depend on force sensing: those of the channels marked `felt`."""
+        felt = [self.observation_slices[channel.name] for channel, _ in self.observed if channel.felt]
+        return [index for part in felt for index in range(part.start, part.stop)]
+
+    def entry_name(self, index: int) -> str:
+        """The channel of an entry of the observation, with the place in it: "contact_force[2]"."""
+        for name, part in self.observation_slices.items():
+            if part.start <= index < part.stop:
+                return f"{name}[{index - part.start}]"
+        raise IndexError(f"the observation has no entry {index}")
+
+    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
+        """The force sensor's reading in an observation [N], shape (3,)."""
+        return np.asarray(observation[self.observation_slices["contact_force"]], dtype=np.float64)
+
+    def read(self, simulation: Simulation) -> FloatArray:
+        """The observation (n_observation,) in SI units, with the last readings of the sensors.
+
+        Raises:
+            ValueError: a channel's `read` returns a value of another size.
+        """
+        return np.concatenate([self._read(channel, size, simulation) for channel, size in self.observed])
+
+    def _read(self, channel: Channel, size: int, simulation: Simulation) -> FloatArray:
+        assert channel.read is not None
+        value = self._task.sensed[channel.name] if channel.sensor else channel.read(self._task, simulation)
+        flat = np.asarray(value, dtype=np.float64).ravel()
+        if flat.size != size:
+            raise ValueError(
+                f"channel {channel.name!r}: read returned {flat.size} numbers, shape {np.shape(value)}; its size is "
+                f"{size}: return that many, or declare another size"
+            )
+        return flat
+
+    def bounds(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the observation with an instrument, shape (n_observation,) each; all finite.
+
+        Raises:
+            ValueError: a channel whose bounds are not finite, do not fit its size, or are the wrong way round.
+        """
+        pairs = [self._channel_bounds(channel, size, instrument) for channel, size in self.observed]
+        return np.concatenate([low for low, _ in pairs]), np.concatenate([high for _, high in pairs])
+
+    def scales(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
+        """Origin and scale of each entry of the observation with an instrument, shape (n_observation,) each.
+
+        An environment observes (value - origin) / scale.
+
+        Raises:
+            ValueError: a channel whose origin or scale is not finite, does not fit its size, or a scale not above 0.
+        """
+        origins = [
+            self._entries(channel, size, "origin", channel.origin, instrument) for channel, size in self.observed
+        ]
+        scales = [self._entries(channel, size, "scale", channel.scale, instrument) for channel, size in self.observed]
+        for (channel, _), scale in zip(self.observed, scales, strict=True):
+            if not (scale > 0.0).all():
+                raise ValueError(f"channel {channel.name!r}: scale is {scale.tolist()}; it must be above 0")
+        return np.concatenate(origins), np.concatenate(scales)
+
+    def _entries(self, channel: Channel, size: int, what: str, given: Any, instrument: Instrument | None) -> FloatArray:
+        """A bound, an origin or a scale of a channel as an array (size,)."""
+        value = np.asarray(given(self._task, instrument) if callable(given) else given, dtype=np.float64)
+        if value.size not in (1, size) or not np.isfinite(value).all():
+            raise ValueError(
+                f"channel {channel.name!r}: {what} is {value.tolist()}; it must be one finite number or {size}, "
+                f"in {channel.unit or 'its own unit'}"
+            )
+        return np.broadcast_to(value.ravel(), size).copy()
+
+    def _channel_bounds(
+        self, channel: Channel, size: int, instrument: Instrument | None
+    ) -> tuple[FloatArray, FloatArray]:
+        if channel.low is None or channel.high is None:
+            reach = np.full(size, self._task.anatomy.scene.sensor.range * channel.sensor)
+            return -reach, reach
+        low = self._entries(channel, size, "a bound", channel.low, instrument)
+        high = self._entries(channel, size, "a bound", channel.high, instrument)
+        if not (low <= high).all():
+            raise ValueError(f"channel {channel.name!r}: low is {low.tolist()}, above high {high.tolist()}: swap them")
+        return low, high
+
+
+def channel_slices(task_class: type[Task], **sizes: int) -> dict[str, slice]:
+    """Slices of a task's observation without an episode, from the sizes of the channels whose size is a function."""
+    return _slices((channel.name, sizes.get(channel.name, channel.size)) for channel in task_class.channels)
+
+
+def _axes(command: Command, task: Task) -> FloatArray | None:
+    """Axes of a command, unit vectors as rows (3, 3); None for the world's."""
+    return None if command.axes is None else command.axes(task)
+
+
+def _size(part: Command | Channel, task: Task) -> int:
+    """The number of entries of a command or channel."""
+    return part.size(task) if callable(part.size) else part.size
+
+
+def _slices(sized: Iterable[tuple[str, Any]]) -> dict[str, slice]:
+    """Consecutive slices, by name; names of size 0 have none."""
+    slices, first = {}, 0
+    for name, size in sized:
+        if size:
+            slices[name] = slice(first, first + size)
+        first += size
+    return slices

@@ -1,0 +1,308 @@
+"""Episodes of a task: their draw, observation, judgement and saved state, from the task's declaration."""
+
+import inspect
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from msdm_core.kernels.structure_kernels import OrganModel
+from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.measure import TissueLoad
+from surgsim_env.coupling.sensors import ForceReading
+from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.scene.anatomy import Anatomy, load_anatomy
+from surgsim_env.scene.family import OrganFamily, family_of
+from surgsim_env.scene.levels import find_level
+from surgsim_env.scene.load import with_instrument
+from surgsim_env.scene.model import ForceSensor
+from surgsim_env.scene.motions import with_motion
+from surgsim_env.tasks.declaration import ControlStep, Reward
+from surgsim_env.tasks.layout import TaskLayout
+from surgsim_env.tasks.task import InfoValue, Scenario, Task
+
+# Draws of an episode until the task has to accept one.
+DRAWS_MOST = 20
+# Name of the end where tissue bears more than the limits of pressure or strain.
+DAMAGE = "damage"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement of a control step: the episode's end, the weighted reward terms, the task's entries of `info`."""
+
+    terminated: bool
+    truncated: bool
+    rewards: dict[str, float]
+    info: dict[str, InfoValue]
+
+
+class TaskRuntime:
+    """Episodes of a task.
+
+    For an episode an environment calls `reset` and `observe`, for each control step `begin` and, when the simulation
+    has advanced, `observe` and `judge`.
+
+    Fields:
+        task: the task
+        layout: of its actions and observations
+        family: members that episodes draw from; None for a scene of one organ
+        sensors: sensor model of each channel that has one, by the channel's name
+        failures: names of the ends that are failures
+    """
+
+    def __init__(self, task: Task, family: OrganFamily | None = None) -> None:
+        """Play the episodes of a task."""
+        self.task, self.family = task, family
+        self.layout = TaskLayout(task)
+        self._sensed = tuple(channel for channel, _ in self.layout.observed if channel.sensor)
+        own = task.anatomy.scene.sensor
+        self.sensors = {channel.name: ForceReading(_scaled(own, channel.sensor)) for channel in self._sensed}
+        declared = [reward.name for reward in task.rewards if reward.per == "failure"]
+        self.failures = tuple(dict.fromkeys(("fault", *declared, "hard_force", DAMAGE)))
+        # Values of the terms that pay for their change.
+        self._reached: dict[str, float] = {}
+
+    # ---- limits of a control step ------------------------------------------------------------------------------
+
+    @property
+    def force_limit(self) -> float:
+        """Contact force that ends a control step within the haptic step [N]."""
+        return self.task.limits.hard_force
+
+    @property
+    def pull_limit(self) -> float:
+        """Likewise the pull of a jaw, of a task with a failure "torn" [N]; else infinite."""
+        return self.task.limits.tear_force if "torn" in self.failures else math.inf
+
+    # ---- an episode --------------------------------------------------------------------------------------------
+
+    def reset(self, simulation: Simulation, rng: np.random.Generator) -> None:
+        """Draw episodes until the task accepts one; organ and instrument are at rest.
+
+        Raises:
+            ValueError: none of DRAWS_MOST draws is accepted.
+        """
+        for _ in range(DRAWS_MOST):
+            tip_position = self.draw(rng)
+            anatomy = self.task.anatomy
+            simulation.take_anatomy(anatomy)
+            simulation.reset(self.task.drawn.compiled(anatomy), tip_position)
+            simulation.draw_motion(rng)
+            if self.task.accepts(simulation):
+                self._reached = self._values(ControlStep(simulation))
+                return
+        raise ValueError(
+            f"scene {self.task.anatomy.scene.name!r}: none of {DRAWS_MOST} draws is an episode that the task accepts: "
+            "narrow the ranges of the scene's draw"
+        )
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw member, organ, biases of the sensors and the task's own; returns the tip's position [m]."""
+        task = self.task
+        if self.family is not None:
+            task.anatomy = self.family.draw(rng)
+        task.step_count = 0
+        self._take(task.setup.drawn.draw(task.anatomy, rng, task.level, task.setup.lesion_count))
+        self._draw_biases(rng, late=False)
+        tip_position = task.draw(rng)
+        self._draw_biases(rng, late=True)
+        return tip_position
+
+    def _take(self, drawn: Any) -> None:
+        self.task.drawn, self.task.lesions = drawn, drawn.lesions
+
+    def _draw_biases(self, rng: np.random.Generator, *, late: bool) -> None:
+        for channel in self._sensed:
+            if channel.late_bias is late:
+                self.sensors[channel.name].reset(rng)
+
+    def begin(self, action: FloatArray, instrument: Instrument) -> None:
+        """Begin a control step: count it and give the instrument the commands of an action (action_size,)."""
+        self.task.step_count += 1
+        self.task.command(self.layout.commands(action), instrument)
+
+    def observe(self, step: ControlStep, rng: np.random.Generator) -> tuple[FloatArray, bool]:
+        """The observation (n_observation,) after a reset or a control step, and whether a sensor saturated.
+
+        Raises:
+            ValueError: a channel's `read` returns a value of another size.
+        """
+        task, simulation, saturated = self.task, step.simulation, False
+        for channel in self._sensed:
+            assert channel.read is not None
+            value = np.asarray(channel.read(task, simulation), dtype=np.float64)
+            task.sensed[channel.name], cut = self.sensors[channel.name].read(value, rng, simulation.time)
+            saturated = saturated or cut
+        task.update(step)
+        return self.layout.read(simulation), saturated
+
+    # ---- judgement ---------------------------------------------------------------------------------------------
+
+    def judge(self, step: ControlStep) -> Verdict:
+        """End a control step, which was observed unless it has a fault."""
+        task, before = self.task, self._reached
+        end = task.end(step)
+        load = step.simulation.tissue_load if task.limits.judges_tissue and not step.fault else None
+        if load is not None and end not in self.failures and self._damages(load):
+            end = DAMAGE
+        if not step.fault:
+            self._reached = self._values(step)
+        # Adding 0.0 turns a product of -0.0 into 0.0.
+        rewards = {
+            reward.name: reward.weight * float(self._amount(reward, step, end, before)) + 0.0 for reward in task.rewards
+        }
+        truncated = not end and task.episode_steps is not None and task.step_count >= task.episode_steps
+        return Verdict(bool(end), truncated, rewards, task.info(step, end) | self._tissue_info(load, end))
+
+    def first_info(self) -> dict[str, InfoValue]:
+        """The task's entries of `info` after a reset."""
+        return self.task.info(None, "") | self._tissue_info(None, "")
+
+    def _values(self, step: ControlStep) -> dict[str, float]:
+        """Values of the terms that pay for their change."""
+        return {
+            reward.name: float(reward.value(self.task, step))
+            for reward in self.task.rewards
+            if reward.per == "change" and reward.value is not None
+        }
+
+    def _amount(self, reward: Reward, step: ControlStep, end: str, before: Mapping[str, float]) -> float:
+        """Factor of a term's weight."""
+        task = self.task
+        if reward.per in ("success", "failure"):
+            # Damage is a safety stop, as too large a force is.
+            return float(end == reward.name or (end == DAMAGE and reward.name == "hard_force"))
+        if reward.per == "change":
+            return self._reached[reward.name] - before[reward.name]
+        if reward.per == "step left":
+            if end not in self.failures:
+                return 0.0
+            if reward.value is None:
+                assert task.episode_steps is not None
+                return float(task.episode_steps - task.step_count)
+        return 1.0 if reward.value is None else reward.value(task, step)
+
+    def _damages(self, load: TissueLoad) -> bool:
+        """Whether tissue bears more than the scene's limits of pressure or strain."""
+        limits = self.task.limits
+        return load.pressure > (limits.pressure or math.inf) or load.strain > (limits.strain or math.inf)
+
+    def _tissue_info(self, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
+        """Largest pressure [Pa] and strain of the tissue, where the scene's limits judge it; 0 without a load."""
+        if not self.task.limits.judges_tissue:
+            return {}
+        pressure, strain = (0.0, 0.0) if load is None else (load.pressure, load.strain)
+        return {"tissue_pressure": pressure, "tissue_strain": strain, "damaged": end == DAMAGE}
+
+    # ---- saved states ------------------------------------------------------------------------------------------
+
+    def get_state(self) -> str:
+        """The draws and counts of the episode, as exact JSON.
+
+        Raises:
+            TypeError: a `kept` attribute that is no number, text, array or list of these.
+        """
+        task = self.task
+        assert task.drawn is not None
+        state = {
+            "drawn": task.drawn.to_json(),
+            "step_count": task.step_count,
+            "bias": {name: sensor.get_state() for name, sensor in self.sensors.items()},
+            "sensed": task.sensed,
+            "reached": self._reached,
+            "kept": {name: getattr(task, name) for name in task.kept},
+        }
+        return json.dumps(state, default=_array_table)
+
+    def saved_organ(self, text: str, anatomy: Anatomy) -> OrganModel:
+        """The organ of the episode whose `get_state` is given; changes nothing.
+
+        Args:
+            text: from `get_state`.
+            anatomy: of the episode: of a family that member's, else the task's own.
+        """
+        return self.task.setup.drawn.from_json(json.loads(text)["drawn"], anatomy).compiled(anatomy)
+
+    def set_state(self, text: str, anatomy: Anatomy) -> None:
+        """Restore a state of `get_state` that `saved_organ` accepted, with the anatomy of that episode."""
+        task, saved = self.task, json.loads(text, object_hook=_array_of)
+        task.anatomy = anatomy
+        self._take(task.setup.drawn.from_json(saved["drawn"], anatomy))
+        task.step_count, task.sensed, self._reached = saved["step_count"], saved["sensed"], saved["reached"]
+        for name, state in saved["bias"].items():
+            self.sensors[name] = ForceReading(self.sensors[name].sensor, state)
+        for name, value in saved["kept"].items():
+            setattr(task, name, value)
+
+
+# ---- the environment's arguments --------------------------------------------------------------------------------
+
+
+def make_runtime(
+    task_class: type[Task],
+    scene: str | None = None,
+    instrument: str | None = None,
+    *,
+    motion: str | None = None,
+    level: str | None = None,
+    split: str | None = None,
+    **settings: Any,
+) -> tuple[Simulation, TaskRuntime]:
+    """Simulation and episodes of a task; the arguments that are None are the task's (`Task.setup`).
+
+    Args:
+        task_class: the task.
+        scene: name or file of a scene.
+        instrument: name of an arm, or its TOML file; else the scene's own.
+        motion: "none", "calm" or "free": breathing of the patient (`surgsim_env.scene.motions`); else as the level,
+            then the scene says.
+        level: "easy", "standard", "hard" or "clinical": lesions of the organ (`surgsim_env.scene.levels`).
+        split: "train" (default), "validation" or "test": members of a scene's family (`surgsim_env.scene.family`); left
+            out for scenes of one organ.
+        settings: keyword-only parameters of the task's `__init__`.
+    """
+    setup = task_class.setup
+    level = level or setup.level
+    chosen = None if level is None else find_level(level)
+    plain = setup.load(setup.scene if scene is None else scene)
+    armed = with_instrument(plain, setup.instrument if instrument is None else instrument)
+    described = with_motion(armed, motion or (chosen and chosen.motion))
+    anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
+    family = family_of(anatomy, split)
+    simulation = Simulation(anatomy)
+    task = task_class(Scenario(anatomy, simulation.instrument, chosen, family, plain), **settings)
+    return simulation, TaskRuntime(task, family)
+
+
+def setting_names(task_class: type[Task]) -> set[str]:
+    """Names of the arguments that `make_runtime` takes beside scene and instrument."""
+    parameters = [*inspect.signature(make_runtime).parameters.values()]
+    parameters += inspect.signature(task_class.__init__).parameters.values()
+    return {parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY}
+
+
+def _scaled(sensor: ForceSensor, factor: float) -> ForceSensor:
+    numbers = (sensor.noise, sensor.bias, sensor.range, sensor.drift, sensor.hysteresis)
+    return ForceSensor(*(factor * number for number in numbers))
+
+
+def _array_table(value: Any) -> Any:
+    """An array or a number of numpy's in a saved state, as JSON holds it."""
+    if isinstance(value, np.ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(
+        f"a kept attribute holds a {type(value).__name__}; a saved state holds numbers, texts, arrays and lists of "
+        "these: keep such, and make the rest from them"
+    )
+
+
+def _array_of(table: dict[str, Any]) -> Any:
+    """The array of a table that `_array_table` wrote; any other table unchanged."""
+    return np.array(table["array"], table["dtype"]) if table.keys() == {"array", "dtype"} else table

@@ -1,4 +1,4 @@
-"""One organ's part of model, state, shapes and tools: the whole of an organ alone, or that of one lane.
+"""Views of a single organ in model, state, shapes and tools: all of an organ alone, or the part of a lane.
 
 `lanes` is empty for an organ alone, see `layout_kernels`.
 """
@@ -22,13 +22,13 @@ from msdm_core.kernels.structure_kernels import (
 
 
 class SpringLaw(NamedTuple):
-    """Departures of springs from linear ones in one substep.
+    """Departures of springs from linear springs in one substep.
 
     Fields:
-        stiffens: whether springs of any node have a factor other than 1
-        steepens: whether any node has a steepness above STEEP_EXCESS
-        fades: whether the arms give way in this substep
-        fade: share of its tension that each arm then loses
+        stiffens: True if springs of any node have a factor other than 1
+        steepens: True if any node has a steepness above STEEP_EXCESS
+        fades: True if the arms relax in this substep
+        fade: relative loss of tension of each arm then
     """
 
     stiffens: bool
@@ -38,7 +38,7 @@ class SpringLaw(NamedTuple):
 
 
 class SurfaceView(NamedTuple):
-    """What contact reads of one lane's model."""
+    """Surface of a lane's model, for contact."""
 
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
@@ -46,7 +46,7 @@ class SurfaceView(NamedTuple):
 
 
 class _Supports(NamedTuple):
-    """What supports read of one lane's model."""
+    """Supports of a lane's model."""
 
     support_kind: NDArray[np.int32]
     support_position: FloatArray
@@ -61,7 +61,7 @@ class _Supports(NamedTuple):
 
 
 class _Ground(NamedTuple):
-    """What elastic foundations and the ground's motion read of one lane's model."""
+    """Foundations and motion of the ground of a lane's model."""
 
     support_position: FloatArray
     foundation_nodes: NDArray[np.int32]
@@ -74,7 +74,7 @@ class _Ground(NamedTuple):
 
 
 class TouchedView(NamedTuple):
-    """What contact reads and writes of one lane's state."""
+    """Contact's part of a lane's state."""
 
     node_position: LaneArray
     node_velocity: LaneArray
@@ -89,7 +89,7 @@ class TouchedView(NamedTuple):
 
 
 def lanes_of(model: OrganModel | LaneModel) -> tuple[int, ...]:
-    """As many zeros as there are organs side by side; none for an organ alone."""
+    """A zero for each organ side by side; none for an organ alone."""
     return model.lanes if isinstance(model, LaneModel) else ()
 
 
@@ -98,12 +98,12 @@ def _(model):
     return (lambda model: model.lanes) if model.instance_class is LaneModel else (lambda model: ())
 
 
-# Whether `lanes` is empty, and how many indices an array has, is known when these are compiled: one way is left.
+# The length of `lanes` and the dimensions of arrays are known at compile time: a single branch remains.
 
 
 @njit(**INLINED)
 def entry_of(values, lane):
-    """One lane's number of an array (1, n_lane), or that of an organ alone in an array (1,)."""
+    """Number of a lane in an array (1, n_lane), or of an organ alone in an array (1,)."""
     if values.ndim == 2:
         return values[0, lane]
     return values[lane]
@@ -111,7 +111,7 @@ def entry_of(values, lane):
 
 @njit(**INLINED)
 def set_entry(values, lane, value):
-    """Write what `entry_of` reads."""
+    """Store for `entry_of`."""
     if values.ndim == 2:
         values[0, lane] = value
     else:
@@ -120,7 +120,7 @@ def set_entry(values, lane, value):
 
 @njit(**INLINED_VIEW)
 def column_of(values, lane):
-    """One lane's numbers of an array (n, n_lane), or of all lanes' array (n,)."""
+    """Numbers of a lane in an array (n, n_lane), or in an array (n,) of all lanes."""
     if values.ndim == 2:
         return values[:, lane]
     return values
@@ -128,7 +128,7 @@ def column_of(values, lane):
 
 @njit(**INLINED_VIEW)
 def part_of(lanes, values, lane):
-    """One lane's part of an array whose first index is the lane; an organ alone has the whole array."""
+    """Part of a lane in an array with the lane as first index; an organ alone has the whole array."""
     if len(lanes) == 0:
         return values
     return values[lane]
@@ -150,7 +150,7 @@ def _numbers_of(values, lane, count):
 
 @njit(**INLINED)
 def surface_of(lanes, model, lane):
-    """One lane's surface; kernels that read it take an OrganModel as well."""
+    """Surface of a lane; the OrganModel of an organ alone serves as well."""
     if len(lanes) == 0:
         return model
     count = model.surface_count[lane]
@@ -162,7 +162,7 @@ def surface_of(lanes, model, lane):
 
 @njit(**INLINED)
 def supports_of(lanes, model, lane):
-    """One lane's supports; kernels that read them take an OrganModel as well."""
+    """Supports of a lane; the OrganModel of an organ alone serves as well."""
     if len(lanes) == 0:
         return model
     count = model.support_count[lane]
@@ -196,7 +196,7 @@ def _shifts_of(values, lane):
 
 @njit(**INLINED)
 def ground_of(lanes, model, lane):
-    """One lane's foundations, and how the ground moves; kernels that read them take an OrganModel as well."""
+    """Foundations of a lane and motion of its ground; the OrganModel of an organ alone serves as well."""
     if len(lanes) == 0:
         return model
     return _Ground(
@@ -209,7 +209,7 @@ def ground_of(lanes, model, lane):
 
 @njit(**INLINED)
 def nodes_of(lanes, state):
-    """Position, velocity and force as the tissue's kernels work on them: of an organ alone in rows of four."""
+    """Position, velocity and force for the tissue's kernels: of an organ alone in rows of four."""
     if len(lanes) == 0:
         return state.row_position, state.row_velocity, state.row_force
     return state.node_position, state.node_velocity, state.node_force
@@ -217,7 +217,7 @@ def nodes_of(lanes, state):
 
 @njit(**INLINED)
 def touched_of(lanes, state, lane):
-    """One lane's state, as contact reads and writes it within a call."""
+    """Contact's part of a lane's state, within a call."""
     if len(lanes) == 0:
         return TouchedView(
             state.row_position, state.row_velocity, state.row_force,
@@ -234,7 +234,7 @@ def touched_of(lanes, state, lane):
 
 @njit(**INLINED)
 def shapes_of(lanes, shapes, lane):
-    """One lane's contact shapes."""
+    """Contact shapes of a lane."""
     if len(lanes) == 0:
         return shapes
     return ContactShapes(
@@ -245,7 +245,7 @@ def shapes_of(lanes, shapes, lane):
 
 @njit(**INLINED)
 def response_of(lanes, response, lane):
-    """The response of one lane's tools."""
+    """Response of a lane's tools."""
     if len(lanes) == 0:
         return response
     return ToolResponse(

@@ -1,8 +1,8 @@
 """Model, state, contact shapes, tools and contact law of organs: the structures of the compiled code.
 
-An organ alone has `OrganModel` and `OrganState`; organs of the same tets that advance together, one a lane, have
-`LaneModel` and `LaneState`. MODEL_FIELDS and STATE_FIELDS are the one sheet of their fields: lanes, saved states, blank
-states and the documentation follow from it. Arrays of models are read-only, which numba enforces at compile time.
+An organ alone has `OrganModel` and `OrganState`; vectorised organs of the same tets, each in a lane, have `LaneModel`
+and `LaneState`. MODEL_FIELDS and STATE_FIELDS are the sheet of their fields: lanes, saved states, blank states and the
+documentation follow from it. Arrays of models are read-only, which numba enforces at compile time.
 """
 
 from collections import namedtuple
@@ -20,24 +20,24 @@ FAULT_NONE = 0
 FAULT_INVERTED_TET = 1
 FAULT_NOT_FINITE = 2
 FAULT_CONTACT_LOST = 3
-# Instead of a fault: the lane has no organ, or its organ must not move.
+# In place of a fault: the lane has no organ, or its organ must not move.
 LANE_EMPTY = -1
 
 # Layouts of a field in organs side by side.
 LAYOUTS = {
-    "shared": "as in an organ alone; of a state scratch for one lane after the other",
+    "shared": "as in an organ alone; of a state scratch for the lanes in turn",
     "own": "(..., n_lane) in the lanes' floating-point type, (n_lane,) of a scalar",
     "rest": "as `own` if lanes have rest shapes of their own, else shared",
-    "rows": "(n_lane, ...), of which a lane uses as many rows as it has; of a model as `rest`",
+    "rows": "(n_lane, ...), with the lane's own number of rows in use; of a model as `rest`",
     "first": "shared, that of lane 0 if lanes have rest shapes of their own",
-    "turns": "(n_lane, ...) if organs stiffen, else (1, ...) for one lane after the other",
+    "turns": "(n_lane, ...) if organs stiffen, else (1, ...) for the lanes in turn",
     "halves": "(2, ..., n_lane)",
     "alone": "only in an organ alone",
 }
 
 
 class Field(NamedTuple):
-    """One field of an organ's model or state.
+    """Field of an organ's model or state.
 
     Fields:
         name: in `OrganModel` or `OrganState`
@@ -56,36 +56,36 @@ class Field(NamedTuple):
     dtype: str
 
     def lengths(self, sizes: Mapping[int | str, int]) -> tuple[Any, ...]:
-        """The shape in an organ alone, from lengths by name."""
+        """Shape in an organ alone, from lengths by name."""
         return tuple([sizes.get(length, length) for length in self.shape])
 
 
 def _field(name: str, unit: str, shape: str, lanes: str, meaning: str, dtype: str = "float64") -> Field:
-    """A field whose lengths are written as "n_node 3"."""
+    """Field with lengths written as "n_node 3"."""
     lengths = tuple(int(length) if length.isdigit() else length for length in shape.split())
     return Field(name, unit, lengths, lanes, meaning, dtype)
 
 
 # Lengths: n_soft is n_node, n_steep n_spring and n_relaxing n_spring, or 0 if no spring stiffens or relaxes; n_arm is
-# 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.compile.state_sizes`.
+# 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.state.state_sizes`.
 MODEL_FIELDS = (
     _field("node_rest_position", "m", "n_node 3", "first", "undeformed position"),
     _field("node_mass", "kg", "n_node", "own", "lumped mass"),
-    _field("node_inverse_mass", "1/kg", "n_node", "own", "1 / mass, 0 where the node is anchored"),
+    _field("node_inverse_mass", "1/kg", "n_node", "own", "1 / mass, 0 at anchored nodes"),
     _field("spring_nodes", "", "n_spring 2", "shared", "both ends; spring t is tet t's first edge", "int32"),
     _field("spring_stiffness", "N/m", "n_spring", "own", "k"),
     _field("spring_rest_length", "m", "n_spring", "rest", "l0"),
-    _field("stiffens", "", "", "shared", "whether any spring stiffens with strain", "bool"),
+    _field("stiffens", "", "", "shared", "True if any spring stiffens with strain", "bool"),
     _field("node_softness", "1/J", "n_soft", "own", "5 / sum of k l0^2 over the springs of a node"),
     _field("node_onset", "", "n_soft", "shared", "e0 of its `Stiffening`"),
     _field("node_growth", "", "n_soft", "shared", "1 / (e1 - e0)"),
     _field("node_excess", "", "n_soft", "shared", "(c - 1) (e1 - e0)"),
     _field("steep_rise", "", "", "shared", "least rise of a spring with a steepness of STEEP_EXCESS"),
     _field("steep_sweeps", "", "", "shared", "most sweeps of `hold_steep`", "int64"),
-    _field("relaxes", "", "", "shared", "whether any spring has Maxwell arms", "bool"),
-    _field("spring_gain", "", "n_relaxing", "shared", "tension at once over that at equilibrium, 1 + sum g_i"),
+    _field("relaxes", "", "", "shared", "True if any spring has Maxwell arms", "bool"),
+    _field("spring_gain", "", "n_relaxing", "shared", "immediate tension over that at equilibrium, 1 + sum g_i"),
     _field("spring_arm_modulus", "", "n_arm", "shared", "g_i, arm by arm"),
-    _field("arm_time", "s", "3", "shared", "tau_i of all springs, inf for an arm that is not used"),
+    _field("arm_time", "s", "3", "shared", "tau_i of all springs, inf for an unused arm"),
     _field("tet_nodes", "", "n_tet 4", "shared", "corners of each tet", "int32"),
     _field("tet_rest_volume", "m^3", "n_tet", "alone", "V0"),
     _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
@@ -94,31 +94,31 @@ MODEL_FIELDS = (
     _field("node_rest_volume", "m^3", "n_node", "alone", "volume averaged at a node, a quarter of its tets"),
     _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
     _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
-    _field("averages_volume", "", "", "own", "whether any node_bulk is above 0", "bool"),
-    _field("surface_triangles", "", "n_surface 3", "rows", "triangles that may be touched, outward", "int32"),
+    _field("averages_volume", "", "", "own", "True if any node_bulk is above 0", "bool"),
+    _field("surface_triangles", "", "n_surface 3", "rows", "triangles open to contact, outward", "int32"),
     _field("surface_rest_area", "m^2", "n_surface", "rows", ""),
-    _field("support_kind", "", "n_support", "shared", "the solids it rests on, PLANE, SPHERE, ...", "int32"),
+    _field("support_kind", "", "n_support", "shared", "solids below it, PLANE, SPHERE, ...", "int32"),
     _field("support_position", "m", "n_support 3", "shared", "middle of each, or a plane's point"),
-    _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world, one a column"),
+    _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world as columns"),
     _field("support_size", "m", "n_support 3", "shared", "radius, half length, half sizes"),
     _field("support_friction", "", "n_support", "shared", "Coulomb coefficient"),
-    _field("support_nodes", "", "n_support_node", "rows", "free nodes that supports may hold", "int32"),
-    _field("support_area", "m^2", "n_support_node", "rows", "surface area that belongs to each of them"),
+    _field("support_nodes", "", "n_support_node", "rows", "free surface nodes", "int32"),
+    _field("support_area", "m^2", "n_support_node", "rows", "surface area of each of them"),
     _field("support_stiffness", "N/m^3", "", "shared", "pressure per penetration"),
     _field("support_damping", "N s/m^3", "", "shared", "pressure per closing speed"),
-    _field("support_tangential_stiffness", "N/m^3", "", "shared", "traction per stretch while sticking"),
-    _field("foundation_nodes", "", "n_held", "shared", "nodes that elastic foundations hold", "int32"),
-    _field("foundation_position", "m", "n_held 3", "rows", "where those nodes are without force"),
-    _field("foundation_stiffness", "N/m", "n_held 3 3", "rows", "force per displacement, all foundations together"),
-    _field("motion_node_shift", "m", "n_motion n_node 4", "rest", "way of the ground per unit of a signal, and 0"),
-    _field("motion_anchored_nodes", "", "n_anchored", "rows", "anchored nodes of an organ whose ground moves", "int64"),
+    _field("support_tangential_stiffness", "N/m^3", "", "shared", "traction per stretch in static friction"),
+    _field("foundation_nodes", "", "n_held", "shared", "nodes on elastic foundations", "int32"),
+    _field("foundation_position", "m", "n_held 3", "rows", "places of those nodes without force"),
+    _field("foundation_stiffness", "N/m", "n_held 3 3", "rows", "force per displacement, sum of all foundations"),
+    _field("motion_node_shift", "m", "n_motion n_node 4", "rest", "shift of the ground per unit of a signal, and 0"),
+    _field("motion_anchored_nodes", "", "n_anchored", "rows", "anchored nodes of an organ on moving ground", "int64"),
     _field("motion_foundation_shift", "m", "n_motion n_held 3", "rows", "likewise at the nodes of foundations"),
     _field("motion_support_shift", "m", "n_motion n_support 3", "shared", "likewise of supports"),
     _field("gravity", "m/s^2", "3", "shared", ""),
     _field("alpha", "1/s", "", "shared", "mass-proportional damping rate"),
     _field("beta", "s", "", "shared", "stiffness-proportional damping time"),
     _field("stable_step", "s", "", "own", "largest stable step without contact of instruments"),
-    _field("added_mass", "kg", "", "alone", "part of node_mass that `stability.scale_mass` added"),
+    _field("added_mass", "kg", "", "alone", "part of node_mass from `stability.scale_mass`"),
 )
 
 # Saved and restored.
@@ -126,43 +126,45 @@ KEPT_FIELDS = (
     _field("node_position", "m", "n_node 3", "own", ""),
     _field("node_velocity", "m/s", "n_node 3", "own", ""),
     _field("node_force", "N", "n_node 3", "own", "force of the last substep, without anchors' reactions"),
-    _field("spring_arm_tension", "N/m", "n_arm", "own", "tension over l0 that each arm has given way to, arm by arm"),
+    _field("spring_arm_tension", "N/m", "n_arm", "own", "relaxed tension over l0 of each arm, arm by arm"),
     _field("spring_relief", "N/m", "n_relaxing", "own", "sum_i g_i times that"),
-    _field("contact_engaged", "", "n_shape n_point", "rows", "1 where a shape holds off a quadrature point", "uint8"),
-    _field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of sticking friction"),
+    _field(
+        "contact_engaged", "", "n_shape n_point", "rows", "1 for a point in contact with a shape", "uint8"
+    ),
+    _field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of static friction"),
     _field("contact_passed", "", "2", "rows", "shape and triangle passed through, after such a fault", "int32"),
-    _field("support_stretch", "m", "n_support_node n_support 3", "rows", "tangential stretch of sticking nodes"),
+    _field("support_stretch", "m", "n_support_node n_support 3", "rows", "tangential stretch of static friction"),
     _field("motion", "1, 1/s, 1/s, J", "n_motion 4", "rows", "signal, rate, rate before, work of the ground"),
-    _field("volume_ratio_smallest", "", "1", "own", "smallest V / V0 seen since it was last set to 1"),
+    _field("volume_ratio_smallest", "", "1", "own", "smallest V / V0 since its last reset to 1"),
 )
 
-# Written anew in every call: need not be saved.
+# Written again in every call, never saved.
 SCRATCH_FIELDS = (
     _field("node_tension", "Pa", "n_node", "own", "tension of the averaged volume term"),
-    _field("row_position", "m", "n_node 4", "alone", "position in rows of four, which load as one"),
+    _field("row_position", "m", "n_node 4", "alone", "position in rows of four, each a register"),
     _field("row_velocity", "m/s", "n_node 4", "alone", "likewise"),
     _field("row_force", "N", "n_node 4", "alone", "likewise"),
-    _field("squeezed_tets", "", "n_tet", "shared", "where tets are squeezed below SQUEEZED_RATIO", "int32"),
+    _field("squeezed_tets", "", "n_tet", "shared", "groups of tets with any below SQUEEZED_RATIO", "int32"),
     _field("node_pairs", "m^3, J; Pa, 1", "n_soft 2", "halves", "sums of volumes and energies, then see set_node_laws"),
     _field("node_steepness", "", "n_soft", "own", "excess of the springs' tangent over 1"),
     _field("spring_lengths", "m", "n_steep", "shared", "lengths of all springs"),
-    _field("steep_springs", "", "n_steep", "shared", "where springs are steep", "int32"),
-    _field("steep_places", "", "n_steep", "shared", "those springs, see squeeze_kernels", "int32"),
+    _field("steep_springs", "", "n_steep", "shared", "groups of springs with any steep", "int32"),
+    _field("steep_places", "", "n_steep", "shared", "steep springs, see squeeze_kernels", "int32"),
     _field("steep_rows", "", "n_steep steep_width", "own", "likewise"),
-    _field("steep_speed", "m/s", "n_soft 3", "own", "speed that their nodes get to"),
+    _field("steep_speed", "m/s", "n_soft 3", "own", "speed of their nodes after all forces"),
     _field("contact_candidates", "", "n_shape n_surface", "rows", "triangles in reach, shape by shape", "int32"),
-    _field("contact_rows", "", "n_row row_width", "turns", "a row for each point held off"),
+    _field("contact_rows", "", "n_row row_width", "turns", "a row for each point in contact"),
     _field("contact_places", "", "n_row place_width", "turns", "shape, point and nodes of each row", "int32"),
     _field("contact_hold", "kg", "n_node", "shared", "hold of contact on a node, times dt^2"),
-    _field("ground_foundation", "m", "n_held 3", "rows", "where foundations hold nodes now"),
-    _field("ground_support", "m, m/s", "n_support 2 3", "rows", "position and velocity of supports now"),
+    _field("ground_foundation", "m", "n_held 3", "rows", "present places of foundations"),
+    _field("ground_support", "m, m/s", "n_support 2 3", "rows", "present position and velocity of supports"),
     _field("ground_load", "N", "n_support 3", "rows", "force of each support on the organ"),
     _field("ground_rate", "1/s", "n_motion", "own", "rates of the motions' signals"),
     _field("lane_fault", "", "1", "rows", "FAULT_ code of the last call", "int32"),
     _field("moving", "", "1", "own", "1 until a fault stops the organ, then 0"),
-    _field("finite_sum", "", "1", "own", "finite where positions and velocities are"),
+    _field("finite_sum", "", "1", "own", "finite if positions and velocities are"),
     _field("candidate_count", "", "1", "rows", "candidates of the busiest shape", "int32"),
-    _field("contact_kept", "", "1", "rows", "0 where the surface passed through an axis", "uint8"),
+    _field("contact_kept", "", "1", "rows", "0 after an axis passed through the surface", "uint8"),
     _field("contact_count", "", "1", "rows", "rows of contact_rows and contact_places in use", "int32"),
 )
 
@@ -171,7 +173,7 @@ KEPT_NAMES = tuple(field.name for field in KEPT_FIELDS)
 
 
 class OrganModel(NamedTuple):
-    """The constants of an organ: read-only arrays, SI units, with the fields of MODEL_FIELDS."""
+    """Constants of an organ: read-only arrays, SI units, with the fields of MODEL_FIELDS."""
 
     node_rest_position: FloatArray
     node_mass: FloatArray
@@ -225,12 +227,12 @@ class OrganModel(NamedTuple):
     added_mass: float
 
     def __deepcopy__(self, memo: dict) -> "OrganModel":
-        """The same: nothing writes to it, and numba would compile everything again for copies that can be written."""
+        """The model itself: it is read-only, and numba would compile everything again for writable copies."""
         return self
 
 
 class OrganState(NamedTuple):
-    """The changing numbers of an organ that moves, SI units, with the fields of STATE_FIELDS."""
+    """State of an organ, SI units, with the fields of STATE_FIELDS."""
 
     node_position: FloatArray
     node_velocity: FloatArray
@@ -272,41 +274,40 @@ class OrganState(NamedTuple):
 
 
 def _in_lanes(fields: tuple[Field, ...]) -> list[str]:
-    """The names of the fields that organs side by side have too."""
+    """Names of the fields of organs side by side."""
     return [field.name for field in fields if field.lanes != "alone"]
 
 
 LaneModel = namedtuple(
     "LaneModel", ("lanes", *_in_lanes(MODEL_FIELDS), "surface_count", "support_count", "anchor_count")
 )
-LaneModel.__doc__ = """The constants of organs side by side: read-only arrays, SI units, in the layouts of MODEL_FIELDS.
+LaneModel.__doc__ = """Constants of vectorised organs: read-only arrays, SI units, in the layouts of MODEL_FIELDS.
 
-`lanes` are as many zeros as there are lanes, so that their number is part of the compiled type. Of the surface, of
-supports and of anchored nodes a lane uses as many rows as it has: surface_count, support_count and anchor_count
-(n_lane,).
+`lanes` has a zero for each lane, so that their number is part of the compiled type. surface_count, support_count and
+anchor_count are the numbers of rows of surface, supports and anchored nodes in use by each lane (n_lane,).
 """
 
 LaneState = namedtuple("LaneState", (*_in_lanes(STATE_FIELDS), "kept_force", "surface_count", "support_count"))
-LaneState.__doc__ = """The changing numbers of organs that move side by side, SI units, in the layouts of STATE_FIELDS.
+LaneState.__doc__ = """State of vectorised organs, SI units, in the layouts of STATE_FIELDS.
 
-lane_fault is LANE_EMPTY where no organ is; `kept_force` is scratch: node_force of the lanes that do not move [N]
-(n_node, 3, n_lane); surface_count and support_count are how much of the memory belongs to a lane (n_lane,).
+lane_fault is LANE_EMPTY for a lane without organ; `kept_force` is scratch: node_force of the stopped lanes [N]
+(n_node, 3, n_lane); surface_count and support_count are the numbers of rows in use by each lane (n_lane,).
 """
 
 
 class ContactShapes(NamedTuple):
-    """Rounded bodies rigidly carried by tools, SI units, world frame: all within a radius of a core.
+    """Rounded bodies rigidly attached to tools, all points within a radius of a core, SI units, world frame.
 
     The core is a point (a ball), an axis (a capsule) or a rectangle (a rounded box), given by its long centre line and
-    the half way across; `stepping.round_shapes` makes balls and capsules.
+    half its width, see `stepping.round_shapes`.
 
     Fields:
         shape_ends: the two end points of the axis [m]                           (n_shape, 2, 3)
         shape_radius: [m]                                                        (n_shape,)
-        shape_tool: the tool that carries the shape                              (n_shape,)
+        shape_tool: its tool                                                     (n_shape,)
         tool_centre: centre of mass, moved along the twist by each substep [m]   (n_tool, 3)
         tool_twist: linear [m/s] at the centre of mass, angular [rad/s]          (n_tool, 6)
-        shape_span: from the axis to the rectangle's border, square to it [m]    (n_shape, 3)
+        shape_span: from the axis to the rectangle's border, normal to it [m]    (n_shape, 3)
         shape_friction: Coulomb coefficient over the contact law's               (n_shape,)
     """
 
@@ -326,7 +327,7 @@ class ToolResponse(NamedTuple):
         tool_acceleration: rate of the twist without the tissue [m/s^2, rad/s^2]  (n_tool, 6)
         tool_mobility: rate of a tool's twist per wrench on each tool [1/kg, ...]  (n_tool, n_tool, 6, 6)
         tool_wrench: scratch: sum of the wrenches before the substep [N, N m]    (n_tool, 6)
-        tool_lag: scratch: how far the tool ends behind twist times step [m, rad] (n_tool, 6)
+        tool_lag: scratch: lag of the tool behind twist times step [m, rad]      (n_tool, 6)
     """
 
     tool_acceleration: FloatArray
@@ -336,13 +337,13 @@ class ToolResponse(NamedTuple):
 
 
 class ContactLaw(NamedTuple):
-    """How tissue and instrument push on each other, per unit of surface area.
+    """Contact law of tissue and instrument, per unit of surface area.
 
     Fields:
         stiffness: pressure per penetration, k_p [N/m^3]
         damping: pressure per closing speed [N s/m^3]
         friction: Coulomb coefficient mu
-        tangential_stiffness: traction per stretch while sticking [N/m^3]
+        tangential_stiffness: traction per stretch in static friction [N/m^3]
     """
 
     stiffness: float

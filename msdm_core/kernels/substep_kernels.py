@@ -1,9 +1,9 @@
-"""The substep: the one sequence of forces, integration and tools, for an organ alone and for organs side by side.
+"""The substep: the sequence of forces, integration and tools, for an organ alone and for organs side by side.
 
-The type of the model decides for which of the two it is compiled: `lanes` is empty for an `OrganModel`. Springs, volume
-term and integration work on all lanes at once (`tissue_kernels`); supports, contact, guard and tools on one lane after
-the other. An organ that stops, by a fault or because its lane is empty, does not affect the lanes beside it.
-Kernels work in place, allocate nothing and use no fastmath: a run repeats to the bit.
+The type of the model decides between the two at compile time: `lanes` is empty for an `OrganModel`. Springs, volume
+term and integration work on all lanes at once (`tissue_kernels`); supports, contact, guard and tools on the lanes in
+turn. A stopped organ (after a fault, or an empty lane) does not affect the lanes beside it. Kernels work in place,
+allocate nothing and use no fastmath: a run repeats to the bit.
 """
 
 import math
@@ -60,13 +60,13 @@ from msdm_core.kernels.tissue_kernels import (
     sum_at_nodes,
 )
 
-# How often the Maxwell arms of springs give way [s]: their shortest time is as long, and usually much longer.
+# Interval of the relaxation of Maxwell arms [s]: no longer than their shortest time, usually much shorter.
 FADE_INTERVAL = 1e-3
 
 
 @njit(**INNER)
 def move_shapes(shapes, dt):
-    """Carry the shapes along the twist of their tool for one substep: x <- x + dt (v + w x (x - c)).
+    """Move the shapes along the twist of their tool for one substep: x <- x + dt (v + w x (x - c)).
 
     In:  dt [s], shapes: tool_twist [m/s, rad/s] (n_tool, 6), shape_tool (n_shape,)
     Out: shapes: shape_ends [m] (n_shape, 2, 3), shape_span [m] (n_shape, 3), tool_centre [m] (n_tool, 3)
@@ -116,7 +116,7 @@ def push_tools(shapes, response, dt, substep, wrench):
 
 @njit(**INNER)
 def _copy_rows(source, target):
-    """The first three columns of an array."""
+    """Copy the first three columns of an array."""
     for node in range(source.shape[0]):
         for axis in range(3):
             target[node, axis] = source[node, axis]
@@ -124,7 +124,7 @@ def _copy_rows(source, target):
 
 @njit(**INLINED)
 def _load_rows(lanes, state):
-    """Positions and velocities of an organ alone into its rows of four."""
+    """Copy positions and velocities of an organ alone into its rows of four."""
     if len(lanes) == 0:
         _copy_rows(state.node_position, state.row_position)
         _copy_rows(state.node_velocity, state.row_velocity)
@@ -132,7 +132,7 @@ def _load_rows(lanes, state):
 
 @njit(**INLINED)
 def _averages(lanes, averages_volume):
-    """Whether any lane has a volume term that is averaged at nodes."""
+    """True if any lane has an averaged volume term."""
     if len(lanes) == 0:
         return averages_volume
     return averages_volume.any()
@@ -140,10 +140,10 @@ def _averages(lanes, averages_volume):
 
 @njit(**INNER)
 def _evaluate(model, state, fades, fade_duration):
-    """Gravity, springs and volume term into the force of all lanes.
+    """Set the force of all lanes to gravity, springs and volume term.
 
-    In: fades: whether the arms of springs give way, for fade_duration [s]
-    Returns how many entries `squeezed_tets` and `steep_springs` have.
+    In: fades: True if the arms of springs relax, for fade_duration [s]
+    Returns the number of entries in `squeezed_tets` and `steep_springs`.
     """
     fade = (0.0, 0.0, 0.0)
     if fades:
@@ -180,7 +180,7 @@ def _evaluate(model, state, fades, fade_duration):
 
 @njit(**INLINED)
 def _lane_count(lanes):
-    """How many organs there are."""
+    """Number of organs."""
     if len(lanes) == 0:
         return 1
     return len(lanes)
@@ -195,7 +195,7 @@ def _wake(lanes, state):
 
 @njit(**INLINED)
 def _keep_forces(lanes, state):
-    """Keep the forces of lanes that do not move: the tissue's kernels overwrite them."""
+    """Keep the forces of stopped lanes: the tissue's kernels overwrite them."""
     if len(lanes) > 0:
         for part in range(3 * state.node_force.shape[0]):
             store_part(lanes, state.kept_force, part, load_part(lanes, state.node_force, part))
@@ -203,14 +203,14 @@ def _keep_forces(lanes, state):
 
 @njit(**INLINED)
 def _put_back_forces(lanes, state):
-    """Restore the forces of lanes that do not move."""
+    """Restore the forces of stopped lanes."""
     if len(lanes) > 0:
         put_back(lanes, state)
 
 
 @njit(**INLINED)
 def _store_motion(lanes, state):
-    """Positions and velocities of an organ alone out of its rows of four."""
+    """Copy positions and velocities of an organ alone from its rows of four."""
     if len(lanes) == 0:
         _copy_rows(state.row_position, state.node_position)
         _copy_rows(state.row_velocity, state.node_velocity)
@@ -218,14 +218,14 @@ def _store_motion(lanes, state):
 
 @njit(**INLINED)
 def _store_force(lanes, state):
-    """Forces of an organ alone out of its rows of four."""
+    """Copy forces of an organ alone from its rows of four."""
     if len(lanes) == 0:
         _copy_rows(state.row_force, state.node_force)
 
 
 @njit(**INNER)
 def _keep_force(state, lane):
-    """Keep one lane's forces as they are."""
+    """Keep the forces of a lane."""
     force, kept = state.node_force, state.kept_force
     for node in range(force.shape[0]):
         for axis in range(3):
@@ -234,7 +234,7 @@ def _keep_force(state, lane):
 
 @njit(**INLINED)
 def _stop(lanes, state, lane, fault):
-    """Stop one lane in its present state."""
+    """Stop a lane in its present state."""
     state.lane_fault[lane] = fault
     set_entry(state.moving, lane, 0.0)
     if len(lanes) > 0:
@@ -243,7 +243,7 @@ def _stop(lanes, state, lane, fault):
 
 @njit(**INLINED)
 def _begin(lanes, model, state, shapes, response, duration):
-    """Note which lanes move and look for the triangles in reach of their shapes."""
+    """Set the moving lanes, their ground and the candidate triangles of their shapes."""
     stands = False
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
@@ -275,7 +275,7 @@ def _begin(lanes, model, state, shapes, response, duration):
 
 @njit(**INLINED)
 def _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrench, lane):
-    """Contact and guard of one lane; notes the points in contact."""
+    """Contact and guard of a lane; sets its number of points in contact."""
     surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
     moved, count = shapes_of(lanes, shapes, lane), state.candidate_count[lane]
     about, push = part_of(lanes, reference, lane), part_of(lanes, wrench, lane)
@@ -287,7 +287,7 @@ def _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrenc
 
 @njit(**INLINED)
 def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane):
-    """What contact and squeezed tets of one lane hold with at the end of the substep."""
+    """Implicit contact and squeezed tets of a lane."""
     surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
     hold_contact(
         surface, touched, shapes_of(lanes, shapes, lane), law, dt, decay, state.contact_count[lane],
@@ -302,10 +302,10 @@ def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference
 
 @njit(**INLINED)
 def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count, steep_count, reference, wrench):
-    """What holds an organ, contact, guard, steep springs, squeezed tets, lane by lane; returns how many lanes move.
+    """Supports, contact, guard, steep springs and squeezed tets, lane by lane; returns the number of moving lanes.
 
-    Steep springs are held in all lanes at once, after what comes before them and before what comes after in each.
-    An inverted tet stops its lane before anything moves: the state shows which tet it was.
+    Steep springs are integrated in all lanes at once, in the same order as alone within each lane. An inverted tet
+    stops its lane before any motion, so that the state shows the tet.
     """
     moving = 0
     for lane in range(_lane_count(lanes)):
@@ -343,7 +343,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
 
 @njit(**INLINED)
 def _move_ground(lanes, model, state, dt, decay):
-    """Move what holds the organs that move: anchored nodes by the integration that follows, the others at once."""
+    """Move the ground of the moving organs: foundations and supports now, anchored nodes by the integration after it."""
     if model.motion_node_shift.shape[0] == 0:
         return
     _, velocity, _ = nodes_of(lanes, state)
@@ -363,7 +363,7 @@ def _move_ground(lanes, model, state, dt, decay):
 
 @njit(**INLINED)
 def _move_tools(lanes, state, shapes, response, dt, substep, wrench):
-    """Advance the tools, lane by lane; stop lanes with a fault; returns how many lanes still move."""
+    """Advance the tools, lane by lane, and stop lanes with a fault; returns the number of moving lanes."""
     moving = 0
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
@@ -382,7 +382,7 @@ def _move_tools(lanes, state, shapes, response, dt, substep, wrench):
 
 @njit(**INLINED)
 def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
-    """Mean wrenches and the lag of friction for lanes that move; restore the forces of those that do not."""
+    """Set mean wrenches and the lag of friction of moving lanes; restore the forces of stopped lanes."""
     stands = False
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
@@ -403,7 +403,7 @@ def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
 
 @njit(**INNER)
 def advance_inside(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
-    """`advance_substeps`, as a part of a kernel that calls it."""
+    """`advance_substeps` for other kernels."""
     lanes = lanes_of(model)
     wrench[:] = 0.0
     _wake(lanes, state)
@@ -435,10 +435,10 @@ def advance_inside(model, state, shapes, law, response, dt, decay, substep_count
 
 @njit(**KERNEL)
 def advance_substeps(model, state, shapes, law, response, dt, decay, substep_count, reference, wrench):
-    """Advance organs by some substeps against moving shapes; the kernel behind `organ.advance` and `advance_lanes`.
+    """Advance organs by substeps against moving shapes; the kernel behind `organ.advance` and `advance_lanes`.
 
     Organs side by side (LaneModel, LaneState) have the lane as first index of shapes, response, reference and wrench.
-    A fault stops an organ at the substep that showed it: an organ alone until the next call, a lane for good.
+    A fault stops an organ at its substep: an organ alone until the next call, a lane for good.
 
     Model: model, law, response
     In:    dt [s], decay = exp(-alpha dt), substep_count, reference: point of each tool's torque [m] (n_tool, 3)

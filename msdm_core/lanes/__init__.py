@@ -1,4 +1,4 @@
-"""Many organs advanced side by side in vector registers."""
+"""Vectorised organs, side by side in vector registers."""
 
 from msdm_core.lanes.lanes import lane_responses, lanes_of, stack_organs, stack_shapes
 

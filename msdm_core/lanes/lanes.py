@@ -1,9 +1,9 @@
-"""Organs of one mesh side by side: eight float64 or sixteen float32 advance at once, each as it would alone.
+"""Vectorised organs of one mesh: eight float64 or sixteen float32 side by side, each as it would advance alone.
 
 Each organ has a lane of its own, with its own masses, springs, moduli, contact and tools; mesh, anchors, supports,
-damping, gravity and the laws by which springs stiffen and relax are shared. With `own_rest` organs of the same tets may
-also differ in their rest shape, in what is anchored, and in how foundations hold the same nodes, for a few hundredths
-of the time. In float64 an organ moves to the bit as `stepping.advance_organ` moves it, whoever its neighbours.
+damping, gravity and the laws of stiffening and relaxation are shared. With `own_rest` organs of the same tets may also
+differ in rest shape, anchored nodes and stiffness of foundations at the same nodes, for a few hundredths of the time.
+In float64 an organ moves to the bit as by `stepping.advance_organ`, independent of its neighbours.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,15 +29,16 @@ from msdm_core.kernels.structure_kernels import (
     ToolResponse,
 )
 from msdm_core.kernels.vector_kernels import aligned_zeros, lane_counts
+from msdm_core.mesh.tet_mesh import TET_FACES
 from msdm_core.organ.state import field_sizes, state_sizes, zero_state
 from msdm_core.organ.stepping import unyielding
 
 SHARED = tuple(field.name for field in MODEL_FIELDS if field.lanes == "shared")
 # Fields that follow from the rest shape, shared or each lane's own.
-REST = tuple(field.name for way in ("rest", "rows", "first") for field in MODEL_FIELDS if field.lanes == way)
-# Fields of a state that lanes are filled with: scratch in rows too, as no kernel writes where nothing moves the ground.
+REST = tuple(field.name for layout in ("rest", "rows", "first") for field in MODEL_FIELDS if field.lanes == layout)
+# Fields copied into lanes: scratch in rows too, as no kernel writes the places of a resting ground.
 PART_FIELDS = tuple(field for field in STATE_FIELDS if field.name in KEPT_NAMES or field.lanes == "rows")
-# The number of rows that a lane has, and a field with that many.
+# Numbers of rows in use by a lane, each with a field of that length.
 COUNTS = {
     "surface_count": "surface_triangles",
     "support_count": "support_nodes",
@@ -48,17 +49,17 @@ COUNTS = {
 def stack_organs(
     organs: Sequence[OrganModel], *, dtype: Any = np.float64, lanes: int | None = None, own_rest: bool = False
 ) -> LaneModel:
-    """Organs of one mesh side by side, in the given order; lanes that are left over have copies of the last one.
+    """Organs of one mesh side by side, in the given order; the remaining lanes have copies of the last.
 
     Args:
-        organs: at most as many as there are lanes.
+        organs: at most one for each lane.
         dtype: np.float64 or np.float32.
-        lanes: 8 in float64; 16 (the default) or 8 in float32, where two groups on two cores may be worth more.
-        own_rest: whether each lane has a rest shape and anchors of its own; all have the same tets in any case.
+        lanes: 8 in float64; 16 (the default) or 8 in float32, for two groups on two cores.
+        own_rest: True for a rest shape and anchors of each lane's own; all have the same tets in any case.
 
     Raises:
         OrganError: no organ or too many, another dtype or number of lanes, or an organ that differs from the first in
-            what they share: its mesh, anchors, supports, damping or gravity. Names the lane and the field.
+            a shared field: mesh, anchors, supports, damping or gravity. Names the lane and the field.
     """
     count = lane_count(dtype, lanes)
     if not 1 <= len(organs) <= count:
@@ -85,7 +86,7 @@ def stack_organs(
 
 
 def _lane_zeros(field: Field, sizes: Mapping[int | str, int], lanes: int, dtype: Any) -> NDArray[Any]:
-    """The array of a field in so many lanes, in its layout."""
+    """Array of a field for a number of lanes, in its layout."""
     lengths = field.lengths(sizes)
     match field.lanes:
         case "own" | "rest":
@@ -98,8 +99,8 @@ def _lane_zeros(field: Field, sizes: Mapping[int | str, int], lanes: int, dtype:
 
 
 def surface_rooms(organ: OrganModel) -> dict[int | str, int]:
-    """The most rows that an organ of these tets can have for any anchors, by name."""
-    faces = np.sort(organ.tet_nodes[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
+    """Largest numbers of rows of an organ of these tets with any anchors, by name."""
+    faces = np.sort(organ.tet_nodes[:, TET_FACES].reshape(-1, 3), axis=1)
     outer, times = np.unique(faces, axis=0, return_counts=True)
     outer = outer[times == 1]
     return {
@@ -110,18 +111,22 @@ def surface_rooms(organ: OrganModel) -> dict[int | str, int]:
 
 
 def has_own_rest(model: LaneModel) -> bool:
-    """Whether each lane has a rest shape and anchors of its own."""
+    """True if each lane has a rest shape and anchors of its own."""
     return model.surface_triangles.ndim == 3
 
 
-def same_rest(one: OrganModel, other: OrganModel) -> bool:
-    """Whether two organs have the same rest shape and anchors, so that they can share them as lanes."""
-    same = all(_equal(getattr(one, name), getattr(other, name)) for name in REST)
-    return same and np.array_equal(one.node_inverse_mass == 0.0, other.node_inverse_mass == 0.0)
+def same_rest(first: OrganModel, second: OrganModel) -> bool:
+    """True if two organs have the same rest shape and anchors, which lanes can then share."""
+    same = all(_equal(getattr(first, name), getattr(second, name)) for name in REST)
+    return same and np.array_equal(first.node_inverse_mass == 0.0, second.node_inverse_mass == 0.0)
 
 
 def lane_count(dtype: Any, lanes: int | None) -> int:
-    """How many lanes there are, of those that a type has; OrganError for others."""
+    """Number of lanes of a type, the largest by default.
+
+    Raises:
+        OrganError: another type or number.
+    """
     if np.dtype(dtype) not in (np.float64, np.float32):
         raise OrganError(f"dtype is {np.dtype(dtype)}; lanes are float64 (8 organs) or float32 (16 or 8 organs)")
     known = lane_counts(dtype)
@@ -131,12 +136,12 @@ def lane_count(dtype: Any, lanes: int | None) -> int:
 
 
 def set_lane(model: LaneModel, lane: int, organ: OrganModel) -> None:
-    """Put another organ of the same mesh into a lane, as with another lesion; its state is left as it is (`put_lane`).
+    """Put another organ of the same mesh into a lane, for instance with another lesion; `put_lane` sets its state.
 
-    With rest shapes of their own, the same tets are enough.
+    With rest shapes of the lanes' own, the same tets are enough.
 
     Raises:
-        OrganError: an organ that differs in what the lanes share.
+        OrganError: an organ that differs in a shared field.
     """
     _check_shared(model, lane, organ, model.node_inverse_mass[:, lane] == 0.0)
     _write_lane(model, lane, organ)
@@ -155,7 +160,7 @@ def _check_shared(model: LaneModel, lane: int, organ: OrganModel, anchored: NDAr
 
 
 def _differing(model: LaneModel, organ: OrganModel, names: Sequence[str], anchored: NDArray[np.bool_]) -> str:
-    """The first of some fields in which an organ differs from the lanes, "anchors" if it is they; "" for none."""
+    """First field of several in which an organ differs from the lanes, or "anchors"; "" for none."""
     for name in names:
         if not _equal(getattr(model, name), getattr(organ, name)):
             return name
@@ -193,11 +198,11 @@ def lanes_of(
     lanes: int | None = None,
     own_rest: bool = False,
 ) -> LaneState:
-    """Lanes that start from the states of organs, of which `first` is the first; lanes beyond them are empty."""
+    """Lanes with the states of organs, `first` the first of these; the remaining lanes are empty."""
     count = lane_count(dtype, lanes)
     sizes = field_sizes(MODEL_FIELDS, first) | (surface_rooms(first) if own_rest else {})
     sizes = state_sizes(sizes, shape_count=len(states[0].contact_engaged))
-    # Steep springs are held in all lanes at once, between what makes these rows in each lane and what reads them.
+    # Steep springs of all lanes at once come between the writing and the reading of these rows in each lane.
     turns = count if first.stiffens else 1
     state = LaneState(
         **{
@@ -216,7 +221,7 @@ def lanes_of(
 
 
 def _lane_part(field: Field, state: LaneState, lane: int) -> NDArray[Any]:
-    """The part of a field's array that a lane uses, in place, as of an organ alone."""
+    """Part of a field's array in use by a lane, in place, shaped as of an organ alone."""
     array = getattr(state, field.name)
     match field.lanes:
         case "own":
@@ -231,7 +236,7 @@ def _lane_part(field: Field, state: LaneState, lane: int) -> NDArray[Any]:
 
 
 def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
-    """Let a lane go on from an organ's state, its fault forgotten; `rest_state(...)` restarts it."""
+    """Set a lane to an organ's state, without fault; `rest_state(...)` restarts it."""
     for field in PART_FIELDS:
         values = getattr(organ, field.name)
         # Lanes with rest shapes of their own have room for the organ with the largest surface.
@@ -242,7 +247,7 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
 
 
 def get_lane(state: LaneState, lane: int) -> OrganState:
-    """A copy of one lane's state as that of an organ alone, in float64: to measure, to save, to describe a fault."""
+    """Copy of a lane's state as that of an organ alone, in float64: for measures, saved states, fault messages."""
     parts = {field: _lane_part(field, state, lane) for field in STATE_FIELDS if field.lanes != "alone"}
     sizes = field_sizes(parts, parts.values())
     surface, points = state.surface_count[lane], QUADRATURE_COUNT * state.surface_count[lane]
@@ -255,19 +260,19 @@ def get_lane(state: LaneState, lane: int) -> OrganState:
 
 
 def stack_shapes(shapes: Sequence[ContactShapes], lanes: int = 8) -> ContactShapes:
-    """The contact shapes of several lanes, equally many each, with the lane as first index; the last one fills up.
+    """Contact shapes of several lanes, equally many each, with the lane as first index; the last fill the remainder.
 
-    `lane_shapes` gives one lane of it to write to.
+    `lane_shapes` is the writable view of a lane.
     """
     filled = [shapes[min(lane, len(shapes) - 1)] for lane in range(lanes)]
     return ContactShapes(*(np.stack(arrays) for arrays in zip(*filled, strict=True)))
 
 
 def lane_shapes(shapes: ContactShapes, lane: int) -> ContactShapes:
-    """One lane of stacked shapes, in place: what is written to it is seen by the kernels."""
+    """Writable view of a lane in stacked shapes."""
     return ContactShapes(*(array[lane] for array in shapes))
 
 
 def lane_responses(tool_count: int, lanes: int = 8) -> ToolResponse:
-    """The responses of every lane's tools, with the lane as first index; zeros: tools that follow their twist."""
+    """Responses of all lanes' tools, with the lane as first index, all 0: tools with a prescribed twist."""
     return ToolResponse(*(np.stack([array] * lanes) for array in unyielding(tool_count)))

@@ -55,7 +55,8 @@ class TetMesh:
     ) -> None:
         point_array = _checked_points(points)
         tet_array = _checked_tets(tets, len(point_array))
-        tet_array, _ = _oriented(point_array, tet_array)
+        negative = _signed_volumes(point_array, tet_array) < 0.0
+        tet_array[negative] = tet_array[negative][:, [0, 1, 3, 2]]
         _check_one_body(tet_array)
         pairs = region_names.items() if isinstance(region_names, dict) else region_names
         object.__setattr__(self, "points", _frozen(point_array))
@@ -82,10 +83,9 @@ class TetMesh:
         array = _checked_points(points)
         if array.shape != self.points.shape:
             raise MeshError(f"{len(array)} points for the {self.node_count} nodes of a mesh: give one for each node")
-        _, inverted = _oriented(array, self.tets.copy())
-        if inverted:
-            tet = int(np.flatnonzero(tet_volumes(array, self.tets) < 0.0)[0])
-            raise MeshError(f"tet {tet} (of {inverted}) is inside out where its nodes are moved to: move them less")
+        inverted = np.flatnonzero(_signed_volumes(array, self.tets) < 0.0)
+        if inverted.size:
+            raise MeshError(f"tet {inverted[0]} (of {inverted.size}) is inside out after the move: move nodes less")
         other = object.__new__(TetMesh)
         kept = {name: getattr(self, name) for name in ("tets", "region", "region_names", "_edge_table", "_boundary")}
         origin = self if self.origin is None else self.origin
@@ -259,7 +259,8 @@ def _checked_tets(tets: ArrayLike, node_count: int) -> IntArray:
     return array
 
 
-def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
+def _signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
+    """Volumes of tets, negative for tets inside out [m^3]; refuses flat ones."""
     # The powers of coordinates above 1e100 overflow: such a tet has no ratio and is refused.
     with np.errstate(over="ignore", invalid="ignore"):
         volumes = tet_volumes(points, tets)
@@ -273,9 +274,7 @@ def _oriented(points: FloatArray, tets: IntArray) -> tuple[IntArray, int]:
             f"tet {tet} (of {flat.size}) is degenerate: volume / longest edge^3 = {ratios[tet]:.2g}, "
             f"the rule is above {DEGENERATE_VOLUME_RATIO:g}: remesh, for instance with mesh_surface"
         )
-    negative = volumes < 0
-    tets[negative] = tets[negative][:, [0, 1, 3, 2]]
-    return tets, int(negative.sum())
+    return volumes
 
 
 def _check_one_body(tets: IntArray) -> None:

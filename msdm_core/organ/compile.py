@@ -116,35 +116,36 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     supports = support_fields(spec.supports, spec.support_law, mesh, surface, anchored)
     foundations = foundation_fields(spec.foundations, mesh, anchored)
     model = OrganModel(
-        node_rest_position=_read_only(mesh.points),
-        node_mass=_read_only(mass),
-        node_inverse_mass=_read_only(np.where(anchored, 0.0, 1.0 / mass)),
-        spring_nodes=_read_only(nodes),
-        spring_stiffness=_read_only(stiffness),
-        spring_rest_length=_read_only(norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)),
+        node_rest_position=mesh.points,
+        node_mass=mass,
+        node_inverse_mass=np.where(anchored, 0.0, 1.0 / mass),
+        spring_nodes=nodes,
+        spring_stiffness=stiffness,
+        spring_rest_length=norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1),
         **spring_law,
-        tet_nodes=_read_only(order.tet_nodes),
-        tet_rest_volume=_read_only(mesh.volumes),
-        tet_inverse_volume=_read_only(1.0 / mesh.volumes),
-        tet_bulk=_read_only(bulk - averaged_bulk),
-        tet_averaged_bulk=_read_only(averaged_bulk),
-        node_rest_volume=_read_only(node_volume),
-        node_inverse_volume=_read_only(1.0 / node_volume),
-        node_bulk=_read_only(node_bulk),
+        tet_nodes=order.tet_nodes,
+        tet_rest_volume=mesh.volumes,
+        tet_inverse_volume=1.0 / mesh.volumes,
+        tet_bulk=bulk - averaged_bulk,
+        tet_averaged_bulk=averaged_bulk,
+        node_rest_volume=node_volume,
+        node_inverse_volume=1.0 / node_volume,
+        node_bulk=node_bulk,
         averages_volume=bool(node_bulk.any()),
-        surface_triangles=_read_only(np.ascontiguousarray(surface)),
-        surface_rest_area=_read_only(norm(area_vectors(mesh.points[surface]), axis=1)),
+        surface_triangles=np.ascontiguousarray(surface),
+        surface_rest_area=norm(area_vectors(mesh.points[surface]), axis=1),
         **supports,
         **foundations,
         **motion_fields(
             spec.motions, mesh.points, anchored, foundations["foundation_nodes"], supports["support_position"]
         ),
-        gravity=_read_only(_checked_gravity(spec.gravity)),
+        gravity=_checked_gravity(spec.gravity),
         alpha=float(spec.damping.alpha),
         beta=float(spec.damping.beta),
         stable_step=0.0,
         added_mass=0.0,
     )
+    model = OrganModel._make(_read_only(value) if isinstance(value, np.ndarray) else value for value in model)
     return model._replace(stable_step=own_step(model))
 
 
@@ -310,9 +311,9 @@ def _spring_law(
         difference = node_sum(weight * (amount - first))
         return first + np.divide(difference, total, out=np.zeros_like(total), where=total > 0.0)
 
-    empty = _read_only(np.zeros(0))
+    empty = np.zeros(0)
     fields: dict[str, Any] = dict.fromkeys(("node_softness", "node_onset", "node_growth", "node_excess"), empty)
-    fields |= {"spring_gain": empty, "spring_arm_modulus": empty, "arm_time": _read_only(_arm_times(spec))}
+    fields |= {"spring_gain": empty, "spring_arm_modulus": empty, "arm_time": _arm_times(spec)}
     fields |= {"steep_sweeps": steep_sweeps(1.0 + float(law.rise.max())), "steep_rise": math.inf}
     fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
     if fields["stiffens"]:
@@ -325,15 +326,15 @@ def _spring_law(
         nodes = mesh.edges[springs]
         length = norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)
         sums = np.bincount(nodes.ravel(), np.repeat(stiffness * (length * length), 2), mesh.node_count)
-        fields["node_softness"] = _read_only(5.0 / sums)
-        fields["node_onset"] = _read_only(onset)
-        fields["node_growth"] = _read_only(1.0 / width)
-        fields["node_excess"] = _read_only(rise * width)
+        fields["node_softness"] = 5.0 / sums
+        fields["node_onset"] = onset
+        fields["node_growth"] = 1.0 / width
+        fields["node_excess"] = rise * width
         fields["steep_rise"] = _steep_rise(onset, width, rise, nodes)
     if fields["relaxes"]:
         moduli = np.stack([spring_mean(arm) for arm in law.arm_modulus])
-        fields["spring_gain"] = _read_only(1.0 + moduli.sum(axis=0))
-        fields["spring_arm_modulus"] = _read_only(moduli.ravel())
+        fields["spring_gain"] = 1.0 + moduli.sum(axis=0)
+        fields["spring_arm_modulus"] = moduli.ravel()
     return fields
 
 

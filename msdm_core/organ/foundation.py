@@ -62,14 +62,11 @@ def foundation_fields(foundations: Sequence[Foundation], mesh: TetMesh, anchored
             inside = held[triangles[:, corner]]
             np.add.at(blocks, triangles[inside, corner], each[inside])
     nodes = np.flatnonzero(blocks.any(axis=(1, 2)) & ~anchored)
-    fields = {
+    return {
         "foundation_nodes": nodes.astype(np.int32),
-        "foundation_position": mesh.points[nodes].astype(np.float64),
+        "foundation_position": mesh.points[nodes],
         "foundation_stiffness": blocks[nodes],
     }
-    for array in fields.values():
-        array.setflags(write=False)
-    return fields
 
 
 def _surface_nodes(foundation: Foundation, mesh: TetMesh) -> NDArray[Any]:

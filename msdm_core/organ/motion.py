@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msdm_core.errors import OrganError
+from msdm_core.errors import OrganError, require_distinct
 from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
 
@@ -82,10 +82,7 @@ def motion_fields(
     Raises:
         OrganError: two motions of one name.
     """
-    names = [motion.name for motion in motions]
-    for name in names:
-        if names.count(name) > 1:
-            raise OrganError(f"two motions are named {name!r}; names must differ: rename one")
+    require_distinct("motions", [motion.name for motion in motions])
     places = {
         "motion_node_shift": points,
         "motion_foundation_shift": points[np.asarray(foundation_nodes)],
@@ -97,8 +94,6 @@ def motion_fields(
     }
     fields["motion_node_shift"] = np.pad(fields["motion_node_shift"], ((0, 0), (0, 0), (0, 1)))
     fields["motion_anchored_nodes"] = np.flatnonzero(anchored if motions else False)
-    for array in fields.values():
-        array.setflags(write=False)
     return fields
 
 

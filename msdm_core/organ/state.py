@@ -1,4 +1,4 @@
-"""States of organs before they move, by the sheet of fields."""
+"""Initial states of organs, from the sheet of fields."""
 
 from collections.abc import Iterable, Mapping
 
@@ -22,7 +22,7 @@ def blank_state(model: OrganModel, *, shape_count: int = 0) -> OrganState:
 
 
 def field_sizes(fields: Iterable[Field], arrays: Iterable[ArrayLike]) -> dict[int | str, int]:
-    """The lengths of the arrays of some fields, by name."""
+    """Lengths of the arrays of fields, by name."""
     sizes = {}
     for field, array in zip(fields, arrays, strict=True):
         sizes |= zip(field.shape, np.shape(array), strict=True)
@@ -30,7 +30,7 @@ def field_sizes(fields: Iterable[Field], arrays: Iterable[ArrayLike]) -> dict[in
 
 
 def state_sizes(sizes: Mapping[int | str, int], shape_count: int) -> dict[int | str, int]:
-    """The lengths of a state's arrays, by name, from those of its model's."""
+    """Lengths of a state's arrays, by name, from those of its model's."""
     point_count = sizes["n_surface"] * QUADRATURE_COUNT
     return {
         **sizes,
@@ -45,7 +45,7 @@ def state_sizes(sizes: Mapping[int | str, int], shape_count: int) -> dict[int | 
 
 
 def zero_state(sizes: Mapping[int | str, int]) -> OrganState:
-    """A state of zeros, with lengths by name."""
+    """State of zeros, with lengths by name."""
     # Rows and pairs of an organ alone load as registers.
     return OrganState(
         **{

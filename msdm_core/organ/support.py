@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
-from msdm_core.errors import OrganError, require_not_negative, require_positive
+from msdm_core.errors import OrganError, require_distinct, require_not_negative, require_positive
 from msdm_core.kernels.support_kernels import BOX, CAPSULE, PLANE, SPHERE
 from msdm_core.mesh.quality import surface_cell
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, area_vectors
@@ -133,32 +133,25 @@ def support_fields(
     Raises:
         OrganError: two supports of one name, a support smaller than the organ's cells, or no surface to touch.
     """
-    names = [support.name for support in supports]
-    for name in names:
-        if names.count(name) > 1:
-            raise OrganError(f"two supports are named {name!r}; names must differ: rename one")
+    require_distinct("supports", [support.name for support in supports])
     if supports and not len(surface):
         raise OrganError(
-            f"support {names[0]!r} touches nothing: the anchors hold the whole surface; anchor fewer nodes, or give no "
-            "supports"
+            f"support {supports[0].name!r} touches nothing: the anchors hold the whole surface; anchor fewer nodes, or "
+            "give no supports"
         )
     if supports:
         _check_sizes(supports, surface_cell(mesh, surface))
     area = norm(area_vectors(mesh.points[surface]), axis=1)
     node_area = np.bincount(surface.ravel(), np.repeat(area / 3.0, 3), mesh.node_count)
     nodes = np.flatnonzero((node_area > 0.0) & ~anchored) if supports else np.zeros(0, dtype=np.int64)
-    fields = {
+    return {
         "support_kind": np.array([KINDS[support.kind] for support in supports], dtype=np.int32),
         "support_position": np.array([support.position for support in supports]).reshape(-1, 3),
         "support_rotation": np.array([support.frame for support in supports]).reshape(-1, 3, 3),
         "support_size": np.array([(*support.size, 0.0, 0.0, 0.0)[:3] for support in supports]).reshape(-1, 3),
         "support_friction": np.array([support.friction for support in supports], dtype=np.float64),
         "support_nodes": nodes.astype(np.int32),
-        "support_area": node_area[nodes].astype(np.float64),
-    }
-    for array in fields.values():
-        array.setflags(write=False)
-    return fields | {
+        "support_area": node_area[nodes],
         "support_stiffness": float(law.stiffness),
         "support_damping": float(law.damping),
         "support_tangential_stiffness": 0.5 * float(law.stiffness),

@@ -11,22 +11,19 @@ out without that fault, by volumes from the nodes' positions. At the end of a ru
 the first saved state to the bit. Memory is that held by a process between runs, without malloc's reserve of freed
 memory (`memory_held`).
 
-One process for each core (`--processes`); its death is a finding. Prints a table and exits 1 with findings.
+Prints a table and exits 1 with findings; other seeds in other processes use other cores.
 """
 
 import argparse
 import contextlib
 import ctypes
 import gc
-import multiprocessing
 import os
 import sys
 import time
 import traceback
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Generator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,7 +36,6 @@ from rich.table import Table
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_apps.bench.report import describe, load
-from surgsim_env.coupling import core_count
 from surgsim_env.scene import LEVELS
 
 # Arguments of each id.
@@ -168,14 +164,13 @@ class Run:
 
 @dataclass
 class Outcome:
-    """Counts of a run; `findings`, a sentence each; `memory` held after it [bytes]."""
+    """Counts of a run; `findings`, a sentence each."""
 
     substeps: int = 0
     steps: int = 0
     episodes: int = 0
     ends: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
-    memory: float = 0.0
 
 
 def play(run: Run) -> Outcome:
@@ -307,85 +302,44 @@ def memory_held() -> float:
     return memory_resident()
 
 
-def growth(memory: dict[int, float], processes: int) -> float | None:
-    """Median gain of memory [bytes] between the first and the last run of a kind in one process; None for few pairs.
+def growth(memory: list[float]) -> float | None:
+    """Median gain of the memory held after each run [bytes] from the first to the last run of a kind; None for few.
 
     Runs of one kind are compared because kinds hold different amounts; the first of each fills the caches.
-
-    Args:
-        memory: held after each run [bytes], by the run's number.
-        processes: number of processes; they take runs in turn.
     """
-    held = defaultdict(list)
-    for number in sorted(memory):
-        if number >= KINDS:
-            held[number % processes, number % KINDS].append(memory[number])
-    gained = [of_kind[-1] - of_kind[0] for of_kind in held.values() if len(of_kind) > 1]
+    gained = [held[-1] - held[0] for kind in range(KINDS) if len(held := memory[KINDS + kind :: KINDS]) > 1]
     return float(np.median(gained)) if len(gained) >= 5 else None
 
 
-# ---- processes -------------------------------------------------------------------------------------------------------
+# ---- the soak --------------------------------------------------------------------------------------------------------
 
 
-def work(run: Run) -> Outcome:
-    """Play a run in a process of the soak."""
-    try:
-        outcome = play(run)
-    except Exception:  # any is a finding, and the next run goes on
-        outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
-    outcome.memory = memory_held()
-    return outcome
-
-
-def make_process() -> ProcessPoolExecutor:
-    """A process for runs one after the other."""
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-
-
-def play_all(seed: int, processes: int, deadline: float, quick: bool, console: Console) -> int:
-    """Play runs until the deadline (time.time()) and print the table; returns the exit status.
-
-    Process i of n plays the runs i, i + n, i + 2 n and so on.
-    """
+def play_all(seed: int, minutes: float, quick: bool, console: Console) -> int:
+    """Play runs for some minutes and print the table; returns the exit status."""
     before, begin = load(), time.time()
-    pools = [make_process() for _ in range(processes)]
-    playing: dict[Future[Outcome], Run] = {}
     totals: dict[str, Outcome] = {}
-    memory: dict[int, float] = {}
-
-    def submit(number: int) -> None:
-        run = Run.drawn(seed, number, quick=quick)
-        playing[pools[number % processes].submit(work, run)] = run
-
-    for number in range(processes):
-        submit(number)
-    while playing:
-        for future in wait(playing, return_when=FIRST_COMPLETED).done:
-            run = playing.pop(future)
-            try:
-                outcome = future.result()
-                memory[run.number] = outcome.memory
-            except BrokenProcessPool:
-                outcome = Outcome(findings=[f"{run}: the process died"])
-                pools[run.number % processes] = make_process()
-            add(totals.setdefault(run.env_id, Outcome()), outcome)
-            for text in outcome.findings:
-                console.print(f"finding: {text}", markup=False, highlight=False, soft_wrap=True)
-            if time.time() < deadline:
-                submit(run.number + processes)
-    gained, count = growth(memory, processes), sum(len(total.findings) for total in totals.values())
-    grown = gained is not None and gained > GROWTH_MOST
+    memory: list[float] = []
+    while time.time() < begin + 60.0 * minutes:
+        run = Run.drawn(seed, len(memory), quick=quick)
+        try:
+            outcome = play(run)
+        except Exception:  # any is a finding, and the next run goes on
+            outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
+        memory.append(memory_held())
+        add(totals.setdefault(run.env_id, Outcome()), outcome)
+        for text in outcome.findings:
+            console.print(f"finding: {text}", markup=False, highlight=False, soft_wrap=True)
+    gained, count = growth(memory), sum(len(total.findings) for total in totals.values())
     show(totals, console)
     for line in (
         f"{len(memory)} runs of seed {seed} in {(time.time() - begin) / 60.0:.1f} min, {count} findings",
         "memory: too few runs"
         if gained is None
-        else f"memory: {gained / 1e6:+.1f} MB between runs of a kind"
-        f" in a process; the rule is at most {GROWTH_MOST / 1e6:.0f} MB",
+        else f"memory: {gained / 1e6:+.1f} MB between runs of a kind; the rule is at most {GROWTH_MOST / 1e6:.0f} MB",
         describe(before),
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    return 1 if count or grown else 0
+    return int(bool(count) or (gained is not None and gained > GROWTH_MOST))
 
 
 def add(total: Outcome, outcome: Outcome) -> None:
@@ -412,7 +366,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=core_count())
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--replay", metavar="SEED:RUN")
     options = parser.parse_args()
@@ -425,8 +378,7 @@ def main() -> int:
         for finding in outcome.findings:
             console.print(finding, markup=False, highlight=False, soft_wrap=True)
         return 1 if outcome.findings else 0
-    deadline = time.time() + 60.0 * options.minutes
-    return play_all(options.seed, options.processes, deadline, options.quick, console)
+    return play_all(options.seed, options.minutes, options.quick, console)
 
 
 if __name__ == "__main__":

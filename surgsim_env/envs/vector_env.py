@@ -174,6 +174,15 @@ class LaneVectorEnv(VectorEnv):
         """The picture of each environment."""
         return tuple(env.render() for env in self.envs)
 
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Results of a method of each environment, or values of an attribute, as of `SyncVectorEnv`."""
+        values = [getattr(env, name) for env in self.envs]
+        return tuple(value(*args, **kwargs) if callable(value) else value for value in values)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Values of an attribute of each environment."""
+        return self.call(name)
+
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads and close the environments."""
         self._pool.shutdown()

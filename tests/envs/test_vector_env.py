@@ -156,7 +156,8 @@ def test_states_are_saved_and_loaded_as_alone():
         envs.step(actions(step))
         single.step(actions(step)[1])
     state = envs.envs[1].unwrapped.save_state()
-    assert state == single.unwrapped.save_state()
+    assert state == single.unwrapped.save_state() == envs.call("save_state")[1]
+    assert envs.get_attr("scaled") == (True,) * COUNT
     ahead = envs.step(actions(5))[0][1]
     envs.envs[0].unwrapped.load_state(state)
     np.testing.assert_array_equal(envs.step(np.tile(actions(5)[1], (COUNT, 1)))[0][0], ahead)

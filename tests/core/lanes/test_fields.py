@@ -1,6 +1,6 @@
 """The sheet of fields against the classes, and against the arrays of an organ with all parts and of one with none."""
 
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_the_arrays_of_an_organ_have_the_shapes_and_types_of_the_sheet(parts: bo
     state = rest_state(model, shape_count=SHAPES)
     sizes = state_sizes(field_sizes(MODEL_FIELDS, model), SHAPES)
 
-    def check(field: Field, value: object) -> None:
+    def check(field: Field, value: Any) -> None:
         assert np.shape(value) == field.lengths(sizes), field.name
         assert np.asarray(value).dtype == field.dtype, field.name
 

@@ -1,1 +1,1 @@
-"""Agents and how they are trained and scored; run from a checkout, not packaged: see agents/README.md."""
+"""Training and scoring of agents; run from a checkout, not packaged: see agents/README.md."""

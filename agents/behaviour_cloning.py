@@ -22,23 +22,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("dataset", help="its name, such as surgsim/retract/oracle-v0")
     parser.add_argument("--out", type=policy_path, default=Path("runs/clone.json"), help="the policy, NAME.json")
     parser.add_argument("--updates", type=int, default=5000, help="minibatches of the fit")
-    given = parser.parse_args(arguments)
-    dataset = minari.load_dataset(given.dataset)
+    options = parser.parse_args(arguments)
+    dataset = minari.load_dataset(options.dataset)
     if len(dataset.observation_space.shape or ()) != 1:
         raise ValueError(f'the observations are {dataset.observation_space}: record with obs_mode="state"')
     episodes = list(dataset.iterate_episodes())
     seen = np.concatenate([np.asarray(episode.observations)[:-1] for episode in episodes])
-    taken = np.concatenate([np.asarray(episode.actions) for episode in episodes])
-    network = PolicyNetwork(NetworkLayout(), (seen.shape[1], 128, 128, taken.shape[1]), normalised=True)
+    actions = np.concatenate([np.asarray(episode.actions) for episode in episodes])
+    network = PolicyNetwork(NetworkLayout(), (seen.shape[1], 128, 128, actions.shape[1]), normalised=True)
     network.normalise_by(seen)
-    loss = fit(network, seen, taken, updates=given.updates)
+    loss = fit(network, seen, actions, updates=options.updates)
     env = dataset.recover_environment()
     assert env.spec is not None
     description = PolicyDescription(
         env.spec.id, dict(env.spec.kwargs), observation_declaration(env), trained_steps=len(seen)
     )
-    save_policy(network, description, given.out)
-    print(f"{given.dataset}: {len(episodes)} episodes, {len(seen)} steps; mean squared error {loss:.4f}; {given.out}")
+    save_policy(network, description, options.out)
+    print(
+        f"{options.dataset}: {len(episodes)} episodes, {len(seen)} steps; mean squared error {loss:.4f}; {options.out}"
+    )
 
 
 if __name__ == "__main__":

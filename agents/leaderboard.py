@@ -82,12 +82,12 @@ How to score an agent of your own: `docs/own_agent.md`. Differences between two 
 
 def _order(place: str) -> tuple[int, str]:
     levels = ("standard", "easy", "hard", "clinical")
-    found = [index for index, level in enumerate(levels) if place.endswith(level)]
-    return (0 if place.startswith("PalpateSites") else 1, f"{place.rsplit('_', 1)[0]}{found[0] if found else 9}")
+    ranks = [index for index, level in enumerate(levels) if place.endswith(level)]
+    return (0 if place.startswith("PalpateSites") else 1, f"{place.rsplit('_', 1)[0]}{ranks[0] if ranks else 9}")
 
 
 def ranked(rows: Sequence[Result]) -> list[Result]:
-    """The rows of one place as the leaderboard shows them, best first, with the best raster alone."""
+    """The leaderboard's rows of one place, best first, with the best raster alone."""
     if rows[0].env_id == SITES:
         return sorted(best_raster_alone(rows), key=_merit)
     return sorted(rows, key=lambda result: -(result.figures["success"].value or 0.0))
@@ -116,8 +116,8 @@ def _tasks(rows: list[Result]) -> str:
 def _title(result: Result) -> str:
     scene, level = result.scene, result.env_kwargs.get("level")
     moves = f"motion {result.motion}" * bool(result.motion)
-    told = ", ".join(part for part in (level, moves) if part)
-    return " ".join(part for part in (f"`{result.env_id}`", scene, f"({told})" if told else "") if part)
+    details = ", ".join(part for part in (level, moves) if part)
+    return " ".join(part for part in (f"`{result.env_id}`", scene, f"({details})" if details else "") if part)
 
 
 def best_raster_alone(rows: Sequence[Result]) -> list[Result]:
@@ -165,7 +165,7 @@ def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:
     figure = figures.get(name)
     if figure is None or figure.value is None:
         return ""
-    value, low, high = (_number(one, decimals, factor) for one in (figure.value, figure.low, figure.high))
+    value, low, high = (_number(number, decimals, factor) for number in (figure.value, figure.low, figure.high))
     return value if value == low == high else f"{value} ({low} to {high})"
 
 

@@ -6,8 +6,7 @@
 
 Palpation plays a surrogate with a force formula (`surgsim_apps.training.palpate_surrogate`), retraction 16 lobes side
 by side. The run's folder holds checkpoints (pickles: resume only runs of your own), for each start `progress.csv` and
-`evaluations.npz` of the periodic evaluations, and at the end the policy. The same command resumes a run that was
-stopped.
+`evaluations.npz` of the periodic evaluations, and at the end the policy. The same command resumes a stopped run.
 """
 
 import argparse
@@ -44,8 +43,8 @@ class Recipe:
     """A training run.
 
     Args:
-        env_id, env_kwargs: the environment, in which a decision lasts REPEAT control steps.
-        surrogate: whether a formula gives the forces.
+        env_id, env_kwargs: the environment; a decision lasts REPEAT control steps.
+        surrogate: True for forces from a formula.
         layout, hidden: of the policy's network.
         spread: first standard deviation of each entry of the action.
         stages: the curriculum.
@@ -190,9 +189,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--decisions", type=int, help="in place of the recipe's")
     parser.add_argument("--every", type=int, default=40_000, help="decisions between checkpoints and evaluations")
-    given = parser.parse_args()
-    folder = given.out or Path("runs") / f"{given.recipe}-seed{given.seed}"
-    model = train(RECIPES[given.recipe], folder, given.seed, decisions=given.decisions, every=given.every)
+    options = parser.parse_args()
+    folder = options.out or Path("runs") / f"{options.recipe}-seed{options.seed}"
+    model = train(RECIPES[options.recipe], folder, options.seed, decisions=options.decisions, every=options.every)
     print(f"{model.num_timesteps} decisions; policy in {folder}/policy.json")
 
 

@@ -1,9 +1,9 @@
-"""Teach a network the expert of SurgSim/Palpate-v0 on any organ, and correct it where it plays itself (DAgger).
+"""Teach a network the expert of SurgSim/Palpate-v0 on any organ, with corrections in its own episodes (DAgger).
 
     python -m agents.learn_palpate_organs --out runs/palpate_organs.json
 
 The network sees the observation alone, through `surgsim_apps.training.face_features.FaceSummary`. It is fitted to
-imagined features, which fill their ranges, and to the states that it reaches on organs whose forces a formula gives
+imagined features all over their ranges, and to its own states on organs with forces from a formula
 (`surgsim_apps.training.face_surrogate`), all labelled by the expert (`surgsim_apps.scoring.expert_organs`). Features
 are kept in place of observations of 5069 numbers.
 """
@@ -36,7 +36,7 @@ BATCH = 512
 KWARGS = {"memory": True, "frame": "face"}
 # Errors of the player: first-order autoregressive noise on the velocity of every other organ.
 ERROR, ERROR_KEPT = 0.15, 0.9
-# Weight of a state that was reached over that of an imagined one.
+# Weight of a visited state over that of an imagined one.
 REPEAT = 4.0
 # The organs of a round; the first scene stands in the policy's file.
 SCENES = ["liver"] * 3 + ["liver_family"] * 2 + ["kidney_family"] * 2 + ["spleen_family", "phantom", "phantom"]
@@ -81,7 +81,7 @@ def _ways(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def play_round(envs: FaceSurrogate, policy: PolicyNetwork | None) -> tuple[NDArray, NDArray, list[bool]]:
-    """Features (n, SUMMARY_SIZE) of the states that a policy reaches, the expert's actions there (n, 4), and successes.
+    """Features (n, SUMMARY_SIZE) of a policy's states, the expert's actions there (n, 4), and successes.
 
     The policy plays an episode in each environment, or the expert if there is none.
     """
@@ -91,8 +91,8 @@ def play_round(envs: FaceSurrogate, policy: PolicyNetwork | None) -> tuple[NDArr
     seen, labels = [], []
     while not envs.over.all():
         with torch.no_grad():
-            found = face_features(torch.as_tensor(observations))
-            wanted, features = expert_actions(found).numpy(), face_summary(found).numpy()
+            now = face_features(torch.as_tensor(observations))
+            wanted, features = expert_actions(now).numpy(), face_summary(now).numpy()
         seen.append(features[~envs.over])
         labels.append(wanted[~envs.over])
         action = wanted.copy() if policy is None else policy.actions(observations, ())
@@ -114,8 +114,8 @@ def refit(
 ) -> float:
     """Fit the layers to labelled features, each with the weight REPEAT, and to imagined ones; returns the loss."""
     with torch.no_grad():
-        made = imagined(imagined_count, np.random.default_rng(seed))
-        inputs, wanted = face_summary(made).numpy(), expert_actions(made).numpy()
+        features = imagined(imagined_count, np.random.default_rng(seed))
+        inputs, wanted = face_summary(features).numpy(), expert_actions(features).numpy()
     weight = np.concatenate([np.full(len(seen), REPEAT), np.ones(imagined_count)])
     return fit(
         network.layers,
@@ -139,33 +139,33 @@ def main() -> None:
     parser.add_argument("--imagined", type=int, default=100_000, help="imagined features of each fit")
     parser.add_argument("--epochs", type=int, default=12, help="of a fit; the last one has four times as many")
     parser.add_argument("--seed", type=int, default=2_000_000)
-    given = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    torch.manual_seed(given.seed)
+    torch.manual_seed(options.seed)
     begin = time.time()
     envs = FaceSurrogate(
-        [gym.make(ENV_ID, scene=scene, level=given.level, **KWARGS) for scene in given.scenes],
-        np.random.default_rng(given.seed),
+        [gym.make(ENV_ID, scene=scene, level=options.level, **KWARGS) for scene in options.scenes],
+        np.random.default_rng(options.seed),
     )
     seen, labels = np.zeros((0, SUMMARY_SIZE), np.float32), np.zeros((0, 4), np.float32)
     network = PolicyNetwork(NetworkLayout("elu", "FaceSummary"), (SUMMARY_SIZE, 192, 192, 4))
     description = PolicyDescription(
         env_id=ENV_ID,
-        env_kwargs={"scene": given.scenes[0], "level": given.level, **KWARGS},
+        env_kwargs={"scene": options.scenes[0], "level": options.level, **KWARGS},
         observation=observation_declaration(envs.envs[0]),
     )
-    for index in range(given.rounds):
+    for index in range(options.rounds):
         new_seen, new_labels, won = play_round(envs, network if index else None)
         seen, labels = np.concatenate([seen, new_seen]), np.concatenate([labels, new_labels])
-        last = index == given.rounds - 1
+        last = index == options.rounds - 1
         loss = refit(
             *(network, seen, labels),
-            imagined_count=given.imagined,
-            epochs=given.epochs * (4 if last else 1),
+            imagined_count=options.imagined,
+            epochs=options.epochs * (4 if last else 1),
             rates=(3e-4, 3e-5) if last else (1e-3, 3e-4),
             seed=index,
         )
-        save_policy(network, replace(description, trained_steps=len(seen)), given.out)
+        save_policy(network, replace(description, trained_steps=len(seen)), options.out)
         print(
             f"{time.time() - begin:6.0f} s round {index}: success {np.mean(won):.2f}, {len(seen)} steps, "
             f"loss {loss:.5f}",

@@ -4,10 +4,10 @@
     python -m agents.learn_retract --pictures --rounds 22 --out runs/retract_pixels.json
 
 With `--pictures` the policy sees the endoscope's picture of 84 x 84 pixels and the force sensor (obs_mode="rgb_force")
-alone: not where tip, lobe or target are, nor how far the jaw is open. Its expert knows them, but acts on the target's
-place only once the target is in sight, so that a policy can know what it knows. Each state is kept under two looks of
-the split "train". Hard pulls are rare, and tear tissue: they are imagined. Forces of states in which something is
-pulled are scaled up, and the expert, which gives way to them, labels these too.
+alone: neither the places of tip, lobe and target nor the jaw's opening. Its expert has the full state, but uses the
+target only once visible, so that the policy can imitate it. Each state is kept under two looks of the split "train".
+Hard pulls are rare, and tear tissue: they are imagined. Forces of states with a pull are scaled up, and the expert,
+which gives way to them, labels these too.
 """
 
 import argparse
@@ -32,24 +32,24 @@ ID = "SurgSim/Retract-v0"
 PICTURES: dict[str, Any] = {"obs_mode": "rgb_force", "looks": "train"}
 # Training seeds; scores use seeds from 1,000,000.
 FIRST_SEED = 2_000_000
-# Along the lobe, where the expert of pictures grasps it: the middle of the edge [m].
+# Place along the lobe of the grasp by the expert of pictures: the middle of the edge [m].
 GRASP_ALONG = 0.04
 # Noise on played actions, of full scale 1, so that a policy learns to recover (DART, Laskey et al. 2017).
 DISTURBANCE = 0.06
-# Of the first rounds, the share of steps that the expert plays.
+# The expert's share of steps in the first rounds.
 EXPERT_SHARES = (1.0, 0.3)
-# Channels that a layer beside the policy, which is not kept, predicts from features of pictures: they teach what to
-# look at. The errors of all of them together count as much as TAUGHT_WEIGHT entries of the action.
+# Auxiliary targets: channels predicted from features of pictures by a temporary layer beside the policy, so that the
+# features hold them. All of them together count as much as TAUGHT_WEIGHT entries of the action.
 TAUGHT = ("tip_position", "opening", "holds", "edge_points", "visible")
 TAUGHT_WEIGHT = 0.5
-# Share of states with a pull above PULL_LEAST [N] that are kept a second time, with an imagined pull [N]. States in
-# which the jaw pushes without holding anything are rare: all of them are kept, with UNHELD_PULLS imagined pulls each.
-# Of the others SLIPPED_SHARE are imagined without a grip, as if the edge had just slipped out.
+# Share of states with a pull above PULL_LEAST [N] to be kept a second time, with an imagined pull [N]. States of an
+# empty jaw that pushes are rare: all of them are kept, with UNHELD_PULLS imagined pulls each. Of the others
+# SLIPPED_SHARE are imagined without a grip, as if the edge had just slipped out.
 IMAGINED_SHARE, PULL_LEAST, IMAGINED_PULL, UNHELD_PULLS, SLIPPED_SHARE = 0.2, 0.05, (0.4, 1.3), 4, 0.3
 
 
 class TaughtNetwork(torch.nn.Module):
-    """A policy's network and a layer that predicts TAUGHT from its features."""
+    """A policy's network and a layer for predicting TAUGHT from its features."""
 
     def __init__(self, network: PolicyNetwork, taught_count: int) -> None:
         super().__init__()
@@ -77,13 +77,13 @@ class Samples:
     def joined(self) -> tuple[Any, NDArray[np.float32]]:
         """All observations, and their labels."""
         if isinstance(self.seen[0], dict):
-            parts = {name: np.concatenate([one[name] for one in self.seen]) for name in self.seen[0]}
+            parts = {name: np.concatenate([part[name] for part in self.seen]) for name in self.seen[0]}
             return parts, np.concatenate(self.labels)
         return np.concatenate(self.seen), np.concatenate(self.labels)
 
 
 class Player:
-    """Plays environments, and labels what it sees."""
+    """A player of environments; it labels its states."""
 
     def __init__(self, envs: gym.vector.VectorEnv, *, pictures: bool, seed: int) -> None:
         self.envs, self.pictures = envs, pictures
@@ -99,19 +99,19 @@ class Player:
         self.seen, _ = envs.reset(seed=FIRST_SEED + 10_000 * seed)
 
     def play(self, network: PolicyNetwork, samples: Samples, steps: int, expert_share: float) -> list[bool]:
-        """Play so many control steps of all environments; returns whether each episode that ended succeeded."""
+        """Play control steps of all environments; returns the success of each ended episode."""
         won: list[bool] = []
         for _ in range(steps):
-            wanted = np.array([self.expert.act(one.task_observation) for one in self.singles])
+            wanted = np.array([self.expert.act(single.task_observation) for single in self.singles])
             self.keep(samples, wanted)
             by_expert = self.rng.random((len(wanted), 1)) < expert_share
-            taken = np.where(by_expert, wanted, network.actions(self.seen, ()) if expert_share < 1.0 else wanted)
-            noise = self.rng.normal(scale=DISTURBANCE, size=taken.shape)
+            actions = np.where(by_expert, wanted, network.actions(self.seen, ()) if expert_share < 1.0 else wanted)
+            noise = self.rng.normal(scale=DISTURBANCE, size=actions.shape)
             if self.pictures:
                 # Their expert does not turn the wrist back.
                 noise[:, self.turning] = 0.0
-            taken = np.clip(taken + noise, -1.0, 1.0).astype(np.float32)
-            self.seen, _, terminated, truncated, info = self.envs.step(taken)
+            actions = np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
+            self.seen, _, terminated, truncated, info = self.envs.step(actions)
             won += [bool(info["final_info"]["success"][index]) for index in np.flatnonzero(terminated | truncated)]
         return won
 
@@ -121,9 +121,9 @@ class Player:
             samples.seen.append(self.seen.copy())
             samples.labels.append(wanted)
             return
-        taught = np.array([one.as_observed(one.task_observation)[self.taught] for one in self.singles])
-        other = np.stack([one.picture(draw_look(self.ranges, self.rng)) for one in self.singles])
-        for picture in (self.seen["picture"].copy(), other):
+        taught = np.array([single.as_observed(single.task_observation)[self.taught] for single in self.singles])
+        relit = np.stack([single.picture(draw_look(self.ranges, self.rng)) for single in self.singles])
+        for picture in (self.seen["picture"].copy(), relit):
             samples.seen.append({"picture": picture, "force": self.seen["force"].copy()})
             samples.labels.append(np.concatenate([wanted, taught], axis=1))
         chosen, forces, actions = self.imagined()
@@ -133,7 +133,7 @@ class Player:
 
     def imagined(self) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
         """Some of the present states with a harder pull: their numbers (k,), readings and the expert's actions."""
-        pulls, holds = np.array([one.task_observation[[PULL, HOLDS]] for one in self.singles]).T
+        pulls, holds = np.array([single.task_observation[[PULL, HOLDS]] for single in self.singles]).T
         held = self.rng.random(len(pulls)) < IMAGINED_SHARE
         count = np.where(holds > 0.5, held, UNHELD_PULLS)
         chosen = np.repeat(np.arange(len(pulls)), np.where(pulls > PULL_LEAST, count, 0))
@@ -174,35 +174,35 @@ def main() -> None:
     parser.add_argument("--envs", type=int, default=16)
     parser.add_argument("--updates", type=int, default=2000, help="minibatches of a fit, twice as many of the last")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    torch.manual_seed(given.seed)
-    settings = PICTURES if given.pictures else {}
+    torch.manual_seed(options.seed)
+    settings = PICTURES if options.pictures else {}
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": "float32"}
-    envs = gym.make_vec(ID, num_envs=given.envs, **lanes, **settings)
-    if given.pictures:
+    envs = gym.make_vec(ID, num_envs=options.envs, **lanes, **settings)
+    if options.pictures:
         network = PolicyNetwork(NetworkLayout("relu", "PictureAndForce"), (920, 128, 64, 5))
     else:
         network = PolicyNetwork(NetworkLayout("tanh"), (56, 128, 128, 5), normalised=True)
-    player, samples, began = Player(envs, pictures=given.pictures, seed=given.seed), Samples(), time.time()
-    for index in range(given.rounds):
-        won = player.play(network, samples, given.steps, (*EXPERT_SHARES, 0.0)[min(index, len(EXPERT_SHARES))])
-        last = index == given.rounds - 1
-        updates, rates = (2 * given.updates, (1e-3, 3e-5)) if last else (given.updates, (1e-3, 3e-4))
-        loss = learn(network, samples, updates=updates, rates=rates, seed=given.seed + index)
-        count = sum(len(one) for one in samples.labels)
+    player, samples, began = Player(envs, pictures=options.pictures, seed=options.seed), Samples(), time.time()
+    for index in range(options.rounds):
+        won = player.play(network, samples, options.steps, (*EXPERT_SHARES, 0.0)[min(index, len(EXPERT_SHARES))])
+        last = index == options.rounds - 1
+        updates, rates = (2 * options.updates, (1e-3, 3e-5)) if last else (options.updates, (1e-3, 3e-4))
+        loss = learn(network, samples, updates=updates, rates=rates, seed=options.seed + index)
+        count = sum(len(labels) for labels in samples.labels)
         success = float(np.mean(won)) if won else None
         line = {"round": index, "samples": count, "episodes": len(won), "success": success, "loss": loss}
         print(json.dumps({**line, "seconds": round(time.time() - began)}), flush=True)
         description = PolicyDescription(
             env_id=ID,
             # Scores are of looks that are held out.
-            env_kwargs={**settings, "looks": "test"} if given.pictures else {},
+            env_kwargs={**settings, "looks": "test"} if options.pictures else {},
             observation=observation_declaration(player.singles[0]),
             trained_steps=count,
-            seed=given.seed,
+            seed=options.seed,
         )
-        save_policy(network, description, given.out)
+        save_policy(network, description, options.out)
     envs.close()
 
 

@@ -1,22 +1,21 @@
-"""Learn where to press on any organ: an evolution strategy finds the acquisition function of a site policy.
+"""Learn an acquisition function for presses on any organ by an evolution strategy.
 
     python -m agents.learn_sites --faces agents/faces/phantom_standard.npz \
         --check-faces agents/faces/phantom_standard_held.npz --out runs/sites.json
 
 The covariance matrix adaptation evolution strategy (Hansen 2016, "The CMA evolution strategy: a tutorial"; package
 `cma`) changes the 13 numbers of `surgsim_apps.training.acquisition.Acquisition`, beginning at the upper confidence
-bound of `gp_ucb`. All candidates of a generation play the same episodes on faces that
-`agents.record_faces` has recorded, as many of each recording, with `--weights` in the cost; each generation has new
-ones. Processes share the episodes. An episode costs
+bound of `gp_ucb`. All candidates of a generation play the same episodes on faces of `agents.record_faces`, as many of
+each recording, with `--weights` in the cost; each generation has new ones. Processes share the episodes. An episode
+costs
 
     mean error / 20 mm + mean over lines of (presses until the error stays below the line) / presses
     + mean over presses 8 to 20 of 1 / (1 + exp((5 mm - error) / 1 mm))
 
-with the lines 5 mm and 3.3 mm, over the first 30 presses. The last term is a smooth share of episodes whose error is
+with the lines 5 mm and 3.3 mm, over the first 30 presses. The last term is a smooth share of episodes with an error
 above 5 mm after so many presses: the leaderboard counts the presses until that is a half of them. Without it a search
 leaves lesions at errors of 5 to 9 mm and looks for others, which costs less on average and more in the median. The
-policy of the generation that costs least on other episodes is kept: on the faces of `--check-faces`, so that faces it
-has learned on do not choose it.
+policy of the generation with the least cost on `--check-faces` is kept, faces without a part in the learning.
 """
 
 import argparse
@@ -50,29 +49,29 @@ from surgsim_apps.training.site_surrogate import SiteSurrogate, SurrogateFace
 from surgsim_env.palpation import CUTOFF, MAP_SIDE
 
 Draw = Callable[[np.random.Generator], SurrogateFace]
-# From an acquisition function, seeds and what draws faces to the errors [mm] after each press of episodes.
+# From an acquisition function, seeds and a source of faces to the errors [mm] after each press of episodes.
 Play = Callable[[Acquisition, Sequence[int], Draw], list[NDArray[np.float64]]]
 
 ID = "SurgSim/PalpateSites-v0"
-# Steps of the parameters that count alike, in the order of `Acquisition.values`.
+# Comparable steps of the parameters, in the order of `Acquisition.values`.
 PARAMETER_STEPS = (0.7, 1.5, 1.0, 0.7, 0.7, 0.2, 0.5, 0.3, 0.3, 0.2, 0.1, 0.6, 0.4)
 # Standard deviation of the first generation in these steps.
 FIRST_SPREAD = 0.5
 # Lines of the cost [mm].
 LINES_MM = (1000.0 * ERROR_LINE, 1000.0 * ERROR_LINE / 1.5)
-# Presses after which the cost counts errors above the first line, and the width of that step [mm].
+# Presses with counted errors above the first line, and the width of that step [mm].
 EARLY, STEP_WIDTH_MM = slice(7, 20), 1.0
-# Presses of an episode that are played and count: later ones are slow, and hardly differ between candidates.
+# Played presses of an episode: later ones are slow, and hardly differ between candidates.
 PRESSES_MOST = 30
-# Episodes of generation g are drawn from seeds after FIRST_SEED + g GENERATION_SEEDS; those that generations are
-# compared by have seeds of their own.
+# Episodes of generation g are drawn from seeds after FIRST_SEED + g GENERATION_SEEDS; those for comparing generations
+# have seeds of their own.
 FIRST_SEED, GENERATION_SEEDS, CHECK_SEED = 4_000_000, 1000, 3_900_000
 
 
 def play(acquisition: Acquisition, seeds: Sequence[int], draw: Draw) -> list[NDArray[np.float64]]:
-    """Errors [mm] after each press of episodes that an acquisition function plays.
+    """Errors [mm] after each press of episodes of an acquisition function.
 
-    Of each episode the first PRESSES_MOST, or the budget where that is less.
+    An episode ends after PRESSES_MOST, or a smaller budget.
     """
     return [_play(acquisition, seed, draw) for seed in seeds]
 
@@ -95,23 +94,23 @@ def _play(acquisition: Acquisition, seed: int, draw: Draw) -> NDArray[np.float64
 def played(
     acquisition: Acquisition, seeds: Sequence[int], draw: Draw, *, pool: Executor, shares: int
 ) -> list[NDArray[np.float64]]:
-    """As `play`, the episodes in so many shares on the processes of a pool."""
+    """As `play`, the episodes in shares on the processes of a pool."""
     parts = [seeds[share::shares] for share in range(shares)]
     errors = list(pool.map(play, [acquisition] * shares, parts, [draw] * shares))
     return [errors[number % shares][number // shares] for number in range(len(seeds))]
 
 
 def presses_to_stay(errors: NDArray[np.float64], line: float) -> int:
-    """Presses after which errors (n,) are and stay at most a line; n + 1 if they never do."""
+    """Presses until errors (n,) are and stay at most a line; n + 1 for never."""
     above = np.flatnonzero(errors > line)
     return int(above[-1]) + 2 if len(above) else 1
 
 
 def cost(errors: Sequence[NDArray[np.float64]]) -> float:
     """The mean cost of episodes from their errors [mm]."""
-    means = [one.mean() / (1000.0 * CUTOFF) for one in errors]
-    shares = [np.mean([presses_to_stay(one, line) / len(one) for line in LINES_MM]) for one in errors]
-    above = [np.mean(expit((one[EARLY] - LINES_MM[0]) / STEP_WIDTH_MM)) for one in errors]
+    means = [episode.mean() / (1000.0 * CUTOFF) for episode in errors]
+    shares = [np.mean([presses_to_stay(episode, line) / len(episode) for line in LINES_MM]) for episode in errors]
+    above = [np.mean(expit((episode[EARLY] - LINES_MM[0]) / STEP_WIDTH_MM)) for episode in errors]
     return float(np.mean(means) + np.mean(shares) + np.mean(above))
 
 
@@ -123,7 +122,7 @@ class Evolution:
         population: candidates of a generation.
         episodes: of each candidate, on faces of each source.
         seed: of the candidates and the episodes.
-        sources: what draws faces, and its weight in the cost; the weights' sum is 1.
+        sources: of faces, each with its weight in the cost; the weights' sum is 1.
         spread: standard deviation of the first generation in PARAMETER_STEPS.
         play: plays the episodes.
     """
@@ -148,7 +147,7 @@ class Evolution:
         self.generation = self.episode_count = 0
 
     def acquisition(self, steps: NDArray[np.float64]) -> Acquisition:
-        """The acquisition function so many steps from the first one (13,)."""
+        """The acquisition function at a distance in steps from the first one (13,)."""
         return Acquisition(tuple((np.array(Acquisition().values) + steps * PARAMETER_STEPS).tolist()))
 
     @property
@@ -165,7 +164,9 @@ class Evolution:
         first = FIRST_SEED + (1000 * self.seed + self.generation) * GENERATION_SEEDS
         seeds = range(first, first + self.episodes)
         candidates = self.strategy.ask()
-        self.strategy.tell(candidates, [self.cost(self.acquisition(one), seeds, self.sources) for one in candidates])
+        self.strategy.tell(
+            candidates, [self.cost(self.acquisition(steps), seeds, self.sources) for steps in candidates]
+        )
         self.generation += 1
         self.episode_count += self.population * self.episodes * len(self.sources)
 
@@ -177,7 +178,7 @@ def weighted_sources(paths: Sequence[Path], weights: Sequence[float] | None = No
 
 
 def learn(arguments: argparse.Namespace) -> None:
-    """Search; print a line after each generation, and write the policy where it costs less than all before."""
+    """Search; print a line after each generation, and write the policy at each new least cost."""
     context, one_thread = get_context("spawn"), {"initializer": torch.set_num_threads, "initargs": (1,)}
     with ProcessPoolExecutor(arguments.processes, context, **one_thread) as pool:
         _search(arguments, partial(played, pool=pool, shares=arguments.processes))
@@ -188,23 +189,23 @@ def _search(arguments: argparse.Namespace, play: Play) -> None:
     check_sources = weighted_sources(arguments.check_faces, arguments.weights)
     evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, sources, arguments.spread, play)
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
-    made = gym.make(ID, scene="phantom_small").unwrapped
+    env = gym.make(ID, scene="phantom_small").unwrapped
     least = evolution.cost(evolution.best, check, check_sources)
     print(f"begins at cost {least:.3f}", flush=True)
     while evolution.generation < arguments.generations:
         evolution.step()
-        said = evolution.cost(evolution.best, check, check_sources)
+        checked = evolution.cost(evolution.best, check, check_sources)
         print(
-            f"generation {evolution.generation}: cost {said:.3f} on {len(check)} other episodes, "
+            f"generation {evolution.generation}: cost {checked:.3f} on {len(check)} other episodes, "
             f"{time.time() - began:.0f} s",
             flush=True,
         )
-        if said >= least:
+        if checked >= least:
             continue
-        least = said
+        least = checked
         description = PolicyDescription(
             env_id=ID,
-            observation=observation_declaration(made),
+            observation=observation_declaration(env),
             trained_steps=evolution.episode_count,
             seed=arguments.seed,
         )

@@ -1,6 +1,6 @@
 """Episodes as a data set of LeRobot (format v3.0), written by LeRobot itself: states, actions, wrenches, pictures.
 
-Beside LeRobot's files lies meta/surgsim.json: what made the episodes, and the seed of each.
+Beside LeRobot's files lies meta/surgsim.json: the origin of the episodes, and the seed of each.
 """
 
 import json
@@ -28,14 +28,14 @@ def write_dataset(
     """Write episodes one by one as a data set in a new folder.
 
     Args:
-        folder: must not be there.
-        env: where they are played.
+        folder: a new one.
+        env: of the episodes.
         episodes: of `agents.record_demonstrations.record` with the readings of `agents.envhub.env.observe`.
-        cameras: whose pictures were read.
-        recorded: what made the episodes, for meta/surgsim.json.
+        cameras: of the pictures in the readings.
+        recorded: origin of the episodes, for meta/surgsim.json.
 
     Raises:
-        ValueError: the folder is there, or frames that are not a whole number a second.
+        ValueError: an existing folder, or a broken number of frames a second.
     """
     if folder.exists():
         raise ValueError(f"{folder} is there already: name a new folder")
@@ -68,7 +68,7 @@ def write_dataset(
 
 
 def _frames(episode: Any) -> Iterable[dict[str, Any]]:
-    """For each action the reading before it and the reward after it."""
+    """The reading before each action and the reward after it."""
     for index, action in enumerate(episode.actions):
         seen = episode.readings[index]
         yield {
@@ -85,7 +85,7 @@ def features(env: gym.Env, cameras: Iterable[str] = ()) -> dict[str, dict[str, A
     """The features of a data set of an environment, with units, frames and meanings.
 
     Raises:
-        ValueError: an environment whose steps do not last one control step.
+        ValueError: an environment with longer steps than a control step.
     """
     inner: Any = env.unwrapped
     task, instrument = inner.task, inner.simulation.instrument
@@ -101,7 +101,7 @@ def features(env: gym.Env, cameras: Iterable[str] = ()) -> dict[str, dict[str, A
     state = _numbered(inner.layout.observation_slices)
     action = _numbered(inner.layout.action_slices)
     wrench = [f"{side}_{name}" if side else name for side in arms for name in WRENCH_NAMES]
-    described = {
+    table = {
         "action": {
             **_numbers(list(action)),
             "units": "share of the full command, from -1 to 1, as env.step takes it",
@@ -132,12 +132,12 @@ def features(env: gym.Env, cameras: Iterable[str] = ()) -> dict[str, dict[str, A
     }
     for camera in cameras:
         options = inner.renderer.options
-        described[f"observation.images.{camera}"] = {
+        table[f"observation.images.{camera}"] = {
             "dtype": "video",
             "shape": (options.height, options.width, 3),
             "names": ["height", "width", "channels"],
         }
-    return described
+    return table
 
 
 def _numbers(names: list[str]) -> dict[str, Any]:

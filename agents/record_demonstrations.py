@@ -9,8 +9,7 @@ With `--format lerobot` the data set is the folder `--dataset` (`agents/lerobot_
 
 Minari's datasets are stored in the folder MINARI_DATASETS_PATH, by default ~/.minari/datasets. Each episode is stored
 with its seed: `dataset.recover_environment()`, reset with it and stepped with the actions, reproduces the observations
-to the bit. `Recorder` records any other code that steps an
-environment:
+to the bit. `Recorder` records any other code with an environment:
 
     env = Recorder(gym.make("SurgSim/Palpate-v0"))
     ...  # reset and step it
@@ -47,7 +46,7 @@ POLICY_SUFFIXES = (".json", ".safetensors")
 
 # Plays one episode in an environment, reset with a seed.
 Player = Callable[[gym.Env, int], None]
-# Reads what a recording holds of a moment beside observation and info.
+# Reads additions to observation and info for a recording.
 Reading = Callable[[gym.Env], dict[str, Any]]
 
 
@@ -86,7 +85,7 @@ class RecordedEpisode:
 
 
 class Recorder(gym.Wrapper):
-    """Records every episode that is played in an environment.
+    """Records every episode of an environment.
 
     Args:
         env: the environment.
@@ -121,7 +120,7 @@ class Recorder(gym.Wrapper):
         return observation, reward, terminated, truncated, info
 
     def _see(self, observation: Any, info: dict[str, Any]) -> None:
-        """Record observation and info; Minari stores infos as typed arrays, so only numbers and booleans are kept."""
+        """Record observation and info; only numbers and booleans, as Minari stores infos as typed arrays."""
         episode = self.all_episodes[-1]
         episode.observations.append(copy.deepcopy(observation))
         if self._read is not None:
@@ -130,7 +129,7 @@ class Recorder(gym.Wrapper):
 
 
 def play_oracle(env: gym.Env, seed: int) -> None:
-    """Play the oracle, which knows the true state; an error of its script counts as a failed episode."""
+    """Play the oracle with the true state; an error of its script counts as a failed episode."""
     env.reset(seed=seed)
     try:
         run_script(env, oracle_script(env))
@@ -142,12 +141,12 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
     """The player of a name.
 
     Args:
-        by: "oracle", a policy's file, or an agent's MODULE:CLASS as `surgsim evaluate` takes it.
-        env: where it plays, made with gym.make.
-        env_arguments: of the environment, as an agent is told them; without those of the recording's pictures.
+        by: "oracle", a policy's file, or an agent's MODULE:CLASS (`surgsim evaluate`).
+        env: its environment, made with gym.make.
+        env_arguments: of the environment, for an agent; without those of the recording's pictures.
 
     Raises:
-        ValueError: another name, a policy for another environment, or a class that is no agent (says which method).
+        ValueError: another name, a policy for another environment, or a class without a method of agents.
     """
     if by == "oracle":
         return play_oracle
@@ -166,7 +165,7 @@ def player(by: str, env: gym.Env, env_arguments: dict[str, Any]) -> Player:
 
 
 def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
-    """Play one episode, with the random numbers with which the episode of this seed is scored."""
+    """Play one episode, with the random numbers of scores for this seed."""
     observation, _ = env.reset(seed=seed)
     actor.begin(0, env, agent_generator(seed))
     begins, over = np.ones(1, dtype=np.bool_), False
@@ -180,16 +179,16 @@ def play_actor(env: gym.Env, seed: int, actor: EpisodeActor) -> None:
 def record(
     env: gym.Env, play: Player, seeds: Sequence[int], *, keep_failures: bool = False, read: Reading | None = None
 ) -> Iterator[RecordedEpisode]:
-    """Play an episode for each seed; yields those that succeeded, or all.
+    """Play an episode for each seed; yields successful ones, or all.
 
-    Ctrl-C ends it with the episodes that were played to their end.
+    Ctrl-C ends it after the complete episodes.
 
     Raises:
-        ValueError: seeds that are reserved for scores.
+        ValueError: seeds reserved for scores.
     """
-    kept = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
-    if kept is not None:
-        raise ValueError(f"seed {kept} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
+    reserved = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
+    if reserved is not None:
+        raise ValueError(f"seed {reserved} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
     recorder, success_count = Recorder(env, read), 0
     with tqdm(seeds, unit="episode") as progress:
         for index, seed in enumerate(progress):
@@ -209,7 +208,7 @@ def write_dataset(
 ) -> minari.MinariDataset:
     """Write episodes as a Minari dataset with the spec of its environment.
 
-    The dataset is the same as that of `minari.DataCollector`, which requires jax and stores failures.
+    `minari.DataCollector` would require jax and store failures; the dataset is the same.
 
     Args:
         episodes: at least one.
@@ -218,7 +217,7 @@ def write_dataset(
         algorithm_name: of the player.
 
     Raises:
-        ValueError: no episode, or a name that is taken.
+        ValueError: no episode, or a taken name.
     """
     if not episodes:
         raise ValueError("there is no episode to write: none was played, or none succeeded (--keep-failures)")
@@ -258,48 +257,47 @@ def main(arguments: Sequence[str] | None = None) -> None:
     lerobot = parser.add_argument_group("with --format lerobot")
     lerobot.add_argument("--images", nargs="+", choices=CAMERAS, default=[], help="cameras whose pictures are recorded")
     lerobot.add_argument("--image-size", nargs=2, type=int, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
-    given = parser.parse_args(arguments)
-    who = Path(given.by).stem if given.by.endswith(POLICY_SUFFIXES) else given.by
-    if given.format == "lerobot":
-        _record_lerobot(given, who)
+    options = parser.parse_args(arguments)
+    who = Path(options.by).stem if options.by.endswith(POLICY_SUFFIXES) else options.by
+    if options.format == "lerobot":
+        _record_lerobot(options, who)
         return
-    if given.images:
+    if options.images:
         raise ValueError("--images is for --format lerobot: add it, or leave --images out")
-    if get_dataset_path(given.dataset).exists():
-        raise ValueError(f"--dataset {given.dataset} is there already: raise its version, or remove it")
-    env = gym.make(given.env, **given.env_arguments)
-    dataset = write_dataset(list(_episodes(given, env)), env, given.dataset, algorithm_name=who)
-    print(
-        f"{given.dataset}: {dataset.total_episodes} episodes, {dataset.total_steps} steps, in {dataset.spec.data_path}"
-    )
+    if get_dataset_path(options.dataset).exists():
+        raise ValueError(f"--dataset {options.dataset} is there already: raise its version, or remove it")
+    env = gym.make(options.env, **options.env_arguments)
+    dataset = write_dataset(list(_episodes(options, env)), env, options.dataset, algorithm_name=who)
+    counts = f"{dataset.total_episodes} episodes, {dataset.total_steps} steps"
+    print(f"{options.dataset}: {counts}, in {dataset.spec.data_path}")
 
 
-def _episodes(given: argparse.Namespace, env: gym.Env, read: Reading | None = None) -> Iterator[RecordedEpisode]:
-    """The episodes that the command line asks for."""
-    seeds = range(given.first_seed, given.first_seed + given.episodes)
-    play = player(given.by, env, given.env_arguments)
-    return record(env, play, seeds, keep_failures=given.keep_failures, read=read)
+def _episodes(options: argparse.Namespace, env: gym.Env, read: Reading | None = None) -> Iterator[RecordedEpisode]:
+    """Episodes of the command line."""
+    seeds = range(options.first_seed, options.first_seed + options.episodes)
+    play = player(options.by, env, options.env_arguments)
+    return record(env, play, seeds, keep_failures=options.keep_failures, read=read)
 
 
-def _record_lerobot(given: argparse.Namespace, who: str) -> None:
-    """Record as the command line says."""
+def _record_lerobot(options: argparse.Namespace, who: str) -> None:
+    """Record a data set of LeRobot."""
     from agents import lerobot_dataset
     from agents.envhub.env import observe
 
-    width, height = given.image_size
-    sight = {"show_force": False, "width": width, "height": height} if given.images else {}
-    env = gym.make(given.env, **sight, **given.env_arguments)
+    width, height = options.image_size
+    sight = {"show_force": False, "width": width, "height": height} if options.images else {}
+    env = gym.make(options.env, **sight, **options.env_arguments)
     try:
         dataset = lerobot_dataset.write_dataset(
-            Path(given.dataset),
+            Path(options.dataset),
             env,
-            _episodes(given, env, lambda env: observe(env, given.images)),
-            cameras=given.images,
+            _episodes(options, env, lambda env: observe(env, options.images)),
+            cameras=options.images,
             recorded={
-                "env_id": given.env,
-                "env_arguments": given.env_arguments,
+                "env_id": options.env,
+                "env_arguments": options.env_arguments,
                 "recorded_by": who,
-                "failures_kept": given.keep_failures,
+                "failures_kept": options.keep_failures,
                 "physics_version": PHYSICS_VERSION,
             },
         )

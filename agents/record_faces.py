@@ -1,4 +1,4 @@
-"""Record the faces of organs, on which a site policy trains at thousands of presses a second.
+"""Record the faces of organs, for training a site policy at thousands of presses a second.
 
 python -m agents.record_faces --scene liver_family --split train --faces 128 --out runs/liver_faces.npz
 

@@ -24,7 +24,7 @@ MODULE = Path("runs/rllib/module")
 
 
 def make_env(context: dict[str, Any]) -> Any:
-    """One environment, or as many in lanes as RLlib asks for; it runs in the workers."""
+    """One environment, or several in lanes for RLlib; it runs in the workers."""
     import surgsim_env  # noqa: F401  (registers the ids)
 
     if "num_envs" not in context:
@@ -51,15 +51,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--iterations", type=int, default=500)
     parser.add_argument("--batch", type=int, default=2048, help="control steps of an iteration")
-    given = parser.parse_args()
+    options = parser.parse_args()
     ray.init(address="local", include_dashboard=False)
     register_env(ENV_ID, make_env)
     # The first environment on a machine compiles its kernels, for minutes.
     runners = {"num_env_runners": 2, "num_envs_per_env_runner": 8, "gym_env_vectorize_mode": "vector_entry_point"}
     config = PPOConfig().environment(ENV_ID).env_runners(**runners, sample_timeout_s=900.0)
-    config.training(train_batch_size_per_learner=given.batch, minibatch_size=256, lr=3e-4, gamma=0.995)
+    config.training(train_batch_size_per_learner=options.batch, minibatch_size=256, lr=3e-4, gamma=0.995)
     algorithm = config.build_algo()
-    for iteration in range(given.iterations):
+    for iteration in range(options.iterations):
         result = algorithm.train()["env_runners"]
         print(f"iteration {iteration}: return {result.get('episode_return_mean', float('nan')):.2f}", flush=True)
     algorithm.get_module().save_to_path(str(MODULE.resolve()))

@@ -1,8 +1,8 @@
-"""Organs on a CUDA device: forces against the processor's, and times, in one run that a lent card has time for.
+"""Organs on a CUDA device: forces against the processor's, and times, in one short run.
 
     python benchmarks/cuda_organs.py [--out FOLDER]
 
-Each row is a press by tips that move into the organ at 6 cm/s, one a lane. Not run on a card yet.
+Each row is a press by tips on their way into the organ at 6 cm/s, one a lane. Not run on a card yet.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from msdm_core.lanes import stack_shapes
 from msdm_core.organ import advance_organ, rest_state, round_shapes, unyielding
 from surgsim_env.scene import Anatomy, load_anatomy, make_scene
 
-# Scene, lanes, options of `DeviceOrgans`, haptic steps in a launch, in the order in which they matter.
+# Scene, lanes, options of `DeviceOrgans`, haptic steps in a launch, the most important first.
 ROWS: list[tuple[str, int, dict[str, Any], int]] = [
     ("phantom_small", 64, {"dtype": np.float64, "threads": 256}, 1),
     ("phantom", 4096, {}, 10),

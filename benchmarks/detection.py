@@ -1,12 +1,12 @@
-"""Hide lesions in an organ at random, palpate it, and count what each map finds.
+"""Hide lesions in an organ at random, palpate it, and count the findings of each map.
 
     surgsim organ kidney.stl --length-unit mm --out kidney/organ.vtu
     python benchmarks/detection.py kidney/organ.toml --draws 5
 
 A draw places lesions below random sites of the raster: their radius is 0.173 times the cube root of the organ's volume,
-between 10 and 19 mm, their cover 3 to 6 mm, their modulus 8 times the healthy one. A place where a lesion would stick
-out of the organ or touch another is drawn again. Prints a row for each draw and map and a table of all draws, and exits
-1 where a miss has no reason.
+between 10 and 19 mm, their cover 3 to 6 mm, their modulus 8 times the healthy one. A lesion that sticks out of the
+organ or touches another is drawn again. Prints a row for each draw and map and a table of all draws, and exits 1 at a
+miss without a reason.
 """
 
 import argparse
@@ -75,14 +75,15 @@ def palpate(scene_file: Path, draw: int, count: int, console: Console) -> Palpat
 
 
 def show(name: str, draw: int, result: PalpationResult, console: Console) -> int:
-    """Print what each map found in a draw, and why it missed what it did not; returns the misses without a reason."""
+    """Print the findings of each map in a draw, and reasons of its misses; returns the misses without a reason."""
     unexplained = 0
-    for one in result.maps:
-        reasons = [miss.text for miss in result.misses if miss.map_name == one.name]
-        unexplained += len(one.scores) - one.felt_count - len(reasons)
+    for contrast in result.maps:
+        reasons = [miss.text for miss in result.misses if miss.map_name == contrast.name]
+        unexplained += len(contrast.scores) - contrast.felt_count - len(reasons)
         console.print(
-            f"{name}, draw {draw}, {one.name}: {one.felt_count} of {len(one.scores)}, {one.false_alarms} false alarms, "
-            f"{result.wall_time:.0f} s" + "".join(f"\n    {text}" for text in reasons),
+            f"{name}, draw {draw}, {contrast.name}: {contrast.felt_count} of {len(contrast.scores)}, "
+            f"{contrast.false_alarms} false alarms, {result.wall_time:.0f} s"
+            + "".join(f"\n    {text}" for text in reasons),
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     return unexplained
@@ -93,11 +94,12 @@ def add_rows(table: Table, name: str, results: Sequence[PalpationResult]) -> Non
     scene = results[0].anatomy.scene
     allowed = 0.5 * (scene.instrument.tip_radius + scene.palpation.site_spacing) * 1e3
     for maps in zip(*(result.maps for result in results), strict=True):
-        scores = [score for one in maps for score in one.scores]
+        scores = [score for contrast in maps for score in contrast.scores]
         errors = [score.error * 1e3 for score in scores if score.felt]
         table.add_row(
             name, maps[0].name, f"{len(errors)} of {len(scores)}", f"{np.median(errors):.1f}" if errors else "-",
-            f"{allowed:.1f}", f"{np.mean([one.false_alarms for one in maps]):.2f}", str(len(results[0].presses)),
+            f"{allowed:.1f}", f"{np.mean([contrast.false_alarms for contrast in maps]):.2f}",
+            str(len(results[0].presses)),
         )  # fmt: skip
 
 

@@ -1,12 +1,12 @@
-"""Mutated files of the formats that the project reads: each must be valid, or be refused by one line.
+"""Mutated files of the project's input formats: each must be valid, or be refused by one line.
 
     python benchmarks/fuzz.py --seconds 60
     python benchmarks/fuzz.py --inputs 1000 --seed 3 --only meshes,arms
     python benchmarks/fuzz.py --replay arms:17
 
-Valid inputs are made from what is shipped; one to three mutations of their structure (a number becomes NaN, infinite,
+Valid inputs come from shipped files; one to three mutations of their structure (a number becomes NaN, infinite,
 negative, huge or 0; keys are dropped, added, of another type; lines doubled) or of their bytes (flipped, cut, doubled)
-make each input. A finding is another exception than a refusal in one line, a process that ended, or more than 60 s. A
+make each input. A finding is an exception other than a refusal in one line, an ended process, or more than 60 s. A
 worker process reads the inputs, so that a crash is a finding too. Prints a table; 1 with findings.
 """
 
@@ -37,11 +37,11 @@ import numpy as np
 from numpy.random import Generator
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-# Packages whose errors are refusals.
+# Packages with refusals as errors.
 OURS = ("msdm_core", "surgsim_env", "surgsim_apps")
 SECONDS_MOST = 60.0  # for one input
 ADDRESS_SPACE = 16_000_000_000  # of the worker [bytes]: a table for an odd count is refused at once
-START_SECONDS = 600.0  # for the worker's start, which imports libraries
+START_SECONDS = 600.0  # for the worker's start, with imports of libraries
 MESSAGE_LONGEST = 1500  # [characters]
 # Odd numbers, as text.
 ODD = (
@@ -70,7 +70,7 @@ class Outcome(NamedTuple):
     message: str
 
 
-# ---- valid inputs and what reads them ---------------------------------------------------------------------------
+# ---- valid inputs and their readers -----------------------------------------------------------------------------
 
 
 def mesh_cases(folder: Path) -> Iterator[Files]:
@@ -261,7 +261,7 @@ def mutate_bytes(data: bytes, rng: Generator) -> tuple[bytes, str]:
         return b"\x00", "a byte added"
     new, size = bytearray(data), len(data)
     kind = pick(rng, ("flip", "flip", "cut", "drop", "double", "number", "number"))
-    # Half of the places are within the first kilobyte, where headers are.
+    # Half of the places are within the first kilobyte, with the headers.
     first = int(rng.integers(min(size, 1024) if rng.random() < 0.5 else size))
     length = int(rng.integers(1, 64))
     if kind == "flip":
@@ -351,7 +351,7 @@ def attempt(kind: Kind, files: Files) -> Outcome:
             Path(folder, name).write_bytes(data)
         try:
             kind.read(Path(folder, next(iter(files))))
-        # Whatever comes is judged.
+        # Any exception is judged.
         except Exception as error:
             fault = refusal_fault(error)
             message = f"{fault}\n{traceback.format_exc()}" if fault else str(error)
@@ -367,7 +367,7 @@ def valid_inputs(kind: Kind) -> list[Files]:
 
 
 def work(kinds: list[str], pipe: Connection) -> None:
-    """Read inputs whose kind and seed come through a pipe, until the process is ended."""
+    """Read inputs by kind and seed from a pipe, until the process is ended."""
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
@@ -381,7 +381,7 @@ def work(kinds: list[str], pipe: Connection) -> None:
 
 
 class Worker:
-    """A process that reads inputs, started again after it ended or was ended."""
+    """A process for reading inputs, started again after its end."""
 
     def __init__(self, kinds: list[str]) -> None:
         self.kinds = kinds
@@ -398,7 +398,7 @@ class Worker:
         self.pipe.recv()
 
     def read(self, kind: str, seed: int) -> Outcome:
-        """The outcome of an input; a process that ends or takes too long is a finding."""
+        """The outcome of an input; an ended or too slow process is a finding."""
         try:
             self.pipe.send((kind, seed))
             if self.pipe.poll(SECONDS_MOST):
@@ -440,7 +440,7 @@ def run(kinds: list[str], first_seed: int, inputs: int | None, seconds: float) -
 
 
 def replay(text: str) -> int:
-    """Read one input again in this process; print what was changed and the result."""
+    """Read one input again in this process; print its mutations and the result."""
     name, _, seed = text.partition(":")
     if name not in KINDS or not seed.isdigit():
         raise SystemExit(f"fuzz: --replay is {text!r}; the form is KIND:SEED with a kind of {', '.join(KINDS)}")
@@ -453,21 +453,21 @@ def replay(text: str) -> int:
 
 
 def main() -> int:
-    """Run or replay what the command line names."""
+    """Run or replay by the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, help="number of inputs of each kind, in place of --seconds")
     parser.add_argument("--seconds", type=float, default=60.0, help="duration [s]")
     parser.add_argument("--seed", type=int, default=0, help="another number, other inputs")
     parser.add_argument("--only", default=",".join(KINDS), help="kinds, separated by commas")
     parser.add_argument("--replay", metavar="KIND:SEED", help="read one input again, with its traceback")
-    given = parser.parse_args()
-    if given.replay:
-        return replay(given.replay)
-    kinds = given.only.split(",")
+    options = parser.parse_args()
+    if options.replay:
+        return replay(options.replay)
+    kinds = options.only.split(",")
     unknown = [name for name in kinds if name not in KINDS]
     if unknown:
         parser.error(f"--only names {unknown[0]!r}; the kinds are {', '.join(KINDS)}")
-    return run(kinds, given.seed, given.inputs, given.seconds)
+    return run(kinds, options.seed, options.inputs, options.seconds)
 
 
 if __name__ == "__main__":

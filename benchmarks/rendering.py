@@ -50,13 +50,13 @@ def main() -> None:
             begin = time.perf_counter()
             env.render()
             print(f"first {(time.perf_counter() - begin) * 1e3:.0f} ms")
-        for what, function in draw.items():
+        for kind, function in draw.items():
             times = []
             for _ in range(arguments.frames):
                 begin = time.perf_counter()
                 function()
                 times.append(time.perf_counter() - begin)
-            print(f"{what} {1.0 / statistics.median(times):.1f} 1/s")
+            print(f"{kind} {1.0 / statistics.median(times):.1f} 1/s")
         env.close()
 
 

@@ -1,32 +1,29 @@
-"""Play environments for as long as wanted with random, corner and adversarial actions, and watch what must not happen.
+"""Long runs of environments with random, corner and adversarial actions, and checks in every step.
 
     python benchmarks/soak.py --minutes 60
-    python benchmarks/soak.py --minutes 1 --quick    small organs, alone and in float64: kernels that tests compile too
+    python benchmarks/soak.py --minutes 1 --quick    small organs, alone and in float64: kernels of the tests
     python benchmarks/soak.py --replay 0:17          repeats run 17 of seed 0, to the bit (--quick if it was)
 
 A run makes an environment of one of CASES, alone or several side by side, plays some seconds of it and goes on to the
-next; runs are drawn from a seed and their number. Watched in every control step: observations lie in their space,
+next; runs are drawn from a seed and their number. Checked in every control step: observations lie in their space,
 rewards are finite, each end has a name (a fault of FAULTS, a limit, a success, the time), and no tet is turned inside
-out unless the fault says so, by volumes that are computed here from the nodes' positions. At the end of a run a reset
-with the first seed must give the first saved state to the bit. Memory is what a process holds between runs, without
-what malloc keeps of freed memory (`memory_held`).
+out without that fault, by volumes from the nodes' positions. At the end of a run a reset with the first seed must give
+the first saved state to the bit. Memory is that held by a process between runs, without malloc's reserve of freed
+memory (`memory_held`).
 
-One process for each core (`--processes`); one that dies is a finding. Prints a table and exits 1 with findings.
+Prints a table and exits 1 with findings; other seeds in other processes use other cores.
 """
 
 import argparse
 import contextlib
 import ctypes
 import gc
-import multiprocessing
 import os
 import sys
 import time
 import traceback
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Generator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,10 +36,9 @@ from rich.table import Table
 
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_apps.bench.report import describe, load
-from surgsim_env.coupling import core_count
 from surgsim_env.scene import LEVELS
 
-# What each id is played with.
+# Arguments of each id.
 CASES: dict[str, dict[str, tuple[Any, ...]]] = {
     "SurgSim/Palpate-v0": {
         "scene": ("phantom_small", "phantom", "phantom_wide", "liver"),
@@ -58,11 +54,11 @@ WIDTHS: tuple[tuple[int, str], ...] = (
     *((1, "alone"), (8, "float64"), (5, "float64")),
     *((8, "float32"), (16, "float32")),
 )
-# Of a quick soak: the scene of palpation, and how many of WIDTHS.
+# Of a quick soak: the scene of palpation, and the number of WIDTHS.
 QUICK_SCENE, QUICK_WIDTHS = "phantom_small", 3
-# Control steps of a run; a step of PalpateSites is a press, which takes as long as many.
+# Control steps of a run; presses of PalpateSites, each as long as many control steps.
 STEPS, PRESSES = 80, 4
-# A fault's name, and the words of `sim_fault` that it goes with.
+# Names of faults, and their words in `sim_fault`.
 FAULTS = {
     "tet inverted": "turned inside out",
     "contact lost": "contact lost",
@@ -72,11 +68,11 @@ FAULTS = {
     "MuJoCo warning": "MuJoCo warning",
     "out of bounds": "left its bounds",
 }
-# Entries of `info` that name an end which is no fault.
+# Entries of `info` for ends without a fault.
 ENDS = ("success", "hard_limit", "torn", "collided", "declared")
-# Runs until the kinds of environments of a seed repeat: by then all that is kept by scene or kernel is there.
+# Runs until the kinds of environments of a seed repeat: by then everything cached by scene or kernel is there.
 KINDS = 30
-# How much more memory a process may hold from then on [bytes].
+# Largest growth of a process' memory from then on [bytes].
 GROWTH_MOST = 20e6
 
 
@@ -86,7 +82,7 @@ Action = NDArray[np.float32]
 
 
 def random_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
-    """Each entry anew in every step; ignores what is sent to it."""
+    """Each entry anew in every step; sent values are ignored."""
     while True:
         yield rng.uniform(-1.0, 1.0, size).astype(np.float32)
 
@@ -100,7 +96,7 @@ def corner_actions(rng: np.random.Generator, size: int) -> Generator[Action, flo
 
 
 def adversarial_actions(rng: np.random.Generator, size: int) -> Generator[Action, float, None]:
-    """Corners that raise the force: one that did is kept, of one that did not an entry is turned round.
+    """Corners in search of force: after a step without a rise of the force an entry changes its sign.
 
     It is sent the largest contact force of each step [N].
     """
@@ -124,7 +120,7 @@ ACTORS: dict[str, Callable[[np.random.Generator, int], Generator[Action, float, 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: what is made, and how it is played."""
+    """One run: an environment, and the kind of its actions."""
 
     seed: int
     number: int
@@ -150,7 +146,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """How the run is given to --replay."""
+        """The run's name for --replay."""
         return f"{self.seed}:{self.number}"
 
     def __str__(self) -> str:
@@ -158,7 +154,7 @@ class Run:
         return f"run {self.name}, {self.env_id}({chosen}), {self.width} x {self.dtype}, {self.actor} actions"
 
     def make(self) -> gym.vector.VectorEnv:
-        """The environments, which are reset one by one."""
+        """The environments, without automatic resets."""
         if self.dtype == "alone":
             mode = gym.vector.AutoresetMode.DISABLED
             return gym.make_vec(self.env_id, 1, "sync", vector_kwargs={"autoreset_mode": mode}, **self.settings)
@@ -168,14 +164,13 @@ class Run:
 
 @dataclass
 class Outcome:
-    """What a run counted; `findings` are what must not happen, a sentence each; `memory` held after it [bytes]."""
+    """Counts of a run; `findings`, a sentence each."""
 
     substeps: int = 0
     steps: int = 0
     episodes: int = 0
     ends: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
-    memory: float = 0.0
 
 
 def play(run: Run) -> Outcome:
@@ -196,7 +191,7 @@ class Watch:
         self.elapsed = np.zeros(len(self.singles))
 
     def play(self) -> None:
-        """All steps of the run; an episode that ends is followed by one of another seed."""
+        """All steps of the run; an episode is followed by one of another seed."""
         rng = np.random.default_rng((self.run.seed, self.run.number, 1))
         first = self.seeds(rng)
         begun = self.reset(first)
@@ -230,8 +225,8 @@ class Watch:
         self.envs.reset(seed=seeds)
         return [env.save_state() for env in self.singles]
 
-    def find(self, what: str) -> None:
-        self.outcome.findings.append(f"{self.run}: {what}")
+    def find(self, text: str) -> None:
+        self.outcome.findings.append(f"{self.run}: {text}")
 
     def check(self, observations: NDArray[Any], rewards: NDArray[Any]) -> None:
         """Observations lie in their space, rewards are finite."""
@@ -288,17 +283,17 @@ def volume_ratios(simulation: Any) -> NDArray[np.float64]:
 
 
 def memory_resident() -> float:
-    """Resident memory of this process [bytes]; 0 where the system does not say."""
+    """Resident memory of this process [bytes]; 0 if unknown to the system."""
     status = Path("/proc/self/statm")
     return float(int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")) if status.exists() else 0.0
 
 
 def memory_held() -> float:
-    """Memory that this process holds [bytes]: resident after glibc's malloc has returned free pages to the system.
+    """Memory held by this process [bytes]: resident after glibc's malloc has returned free pages to the system.
 
     malloc keeps freed memory for later calls: 30 to 150 MB after a run, another amount after each kind of environments,
     so that resident memory drifts by tens of MB while nothing is held for longer. Without glibc it is resident memory;
-    0 where the system does not say.
+    0 if unknown to the system.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
@@ -307,85 +302,44 @@ def memory_held() -> float:
     return memory_resident()
 
 
-def growth(memory: dict[int, float], processes: int) -> float | None:
-    """Median gain of memory [bytes] between the first and the last run of a kind in one process; None for few pairs.
+def growth(memory: list[float]) -> float | None:
+    """Median gain of the memory held after each run [bytes] from the first to the last run of a kind; None for few.
 
-    Runs of one kind are compared because kinds hold different amounts; the first of each makes what is kept.
-
-    Args:
-        memory: held after each run [bytes], by the run's number.
-        processes: number of processes, which take runs in turn.
+    Runs of one kind are compared because kinds hold different amounts; the first of each fills the caches.
     """
-    held = defaultdict(list)
-    for number in sorted(memory):
-        if number >= KINDS:
-            held[number % processes, number % KINDS].append(memory[number])
-    gained = [of_kind[-1] - of_kind[0] for of_kind in held.values() if len(of_kind) > 1]
+    gained = [held[-1] - held[0] for kind in range(KINDS) if len(held := memory[KINDS + kind :: KINDS]) > 1]
     return float(np.median(gained)) if len(gained) >= 5 else None
 
 
-# ---- processes -------------------------------------------------------------------------------------------------------
+# ---- the soak --------------------------------------------------------------------------------------------------------
 
 
-def work(run: Run) -> Outcome:
-    """Play a run in a process of the soak."""
-    try:
-        outcome = play(run)
-    except Exception:  # whatever it is, it is a finding, and the next run goes on
-        outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
-    outcome.memory = memory_held()
-    return outcome
-
-
-def make_process() -> ProcessPoolExecutor:
-    """A process of its own for runs one after the other."""
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-
-
-def play_all(seed: int, processes: int, deadline: float, quick: bool, console: Console) -> int:
-    """Play runs until the deadline (time.time()) and print the table; returns the exit status.
-
-    Process i of n plays the runs i, i + n, i + 2 n and so on.
-    """
+def play_all(seed: int, minutes: float, quick: bool, console: Console) -> int:
+    """Play runs for some minutes and print the table; returns the exit status."""
     before, begin = load(), time.time()
-    pools = [make_process() for _ in range(processes)]
-    playing: dict[Future[Outcome], Run] = {}
     totals: dict[str, Outcome] = {}
-    memory: dict[int, float] = {}
-
-    def submit(number: int) -> None:
-        run = Run.drawn(seed, number, quick=quick)
-        playing[pools[number % processes].submit(work, run)] = run
-
-    for number in range(processes):
-        submit(number)
-    while playing:
-        for future in wait(playing, return_when=FIRST_COMPLETED).done:
-            run = playing.pop(future)
-            try:
-                outcome = future.result()
-                memory[run.number] = outcome.memory
-            except BrokenProcessPool:
-                outcome = Outcome(findings=[f"{run}: the process died"])
-                pools[run.number % processes] = make_process()
-            add(totals.setdefault(run.env_id, Outcome()), outcome)
-            for text in outcome.findings:
-                console.print(f"finding: {text}", markup=False, highlight=False, soft_wrap=True)
-            if time.time() < deadline:
-                submit(run.number + processes)
-    gained, count = growth(memory, processes), sum(len(total.findings) for total in totals.values())
-    grown = gained is not None and gained > GROWTH_MOST
+    memory: list[float] = []
+    while time.time() < begin + 60.0 * minutes:
+        run = Run.drawn(seed, len(memory), quick=quick)
+        try:
+            outcome = play(run)
+        except Exception:  # any is a finding, and the next run goes on
+            outcome = Outcome(findings=[f"{run}: {traceback.format_exc()}"])
+        memory.append(memory_held())
+        add(totals.setdefault(run.env_id, Outcome()), outcome)
+        for text in outcome.findings:
+            console.print(f"finding: {text}", markup=False, highlight=False, soft_wrap=True)
+    gained, count = growth(memory), sum(len(total.findings) for total in totals.values())
     show(totals, console)
     for line in (
         f"{len(memory)} runs of seed {seed} in {(time.time() - begin) / 60.0:.1f} min, {count} findings",
         "memory: too few runs"
         if gained is None
-        else f"memory: {gained / 1e6:+.1f} MB between runs of a kind"
-        f" in a process; the rule is at most {GROWTH_MOST / 1e6:.0f} MB",
+        else f"memory: {gained / 1e6:+.1f} MB between runs of a kind; the rule is at most {GROWTH_MOST / 1e6:.0f} MB",
         describe(before),
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    return 1 if count or grown else 0
+    return int(bool(count) or (gained is not None and gained > GROWTH_MOST))
 
 
 def add(total: Outcome, outcome: Outcome) -> None:
@@ -412,7 +366,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=core_count())
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--replay", metavar="SEED:RUN")
     options = parser.parse_args()
@@ -422,11 +375,10 @@ def main() -> int:
         console.print(str(run), markup=False, highlight=False, soft_wrap=True)
         outcome = play(run)
         show({run.env_id: outcome}, console)
-        for one in outcome.findings:
-            console.print(one, markup=False, highlight=False, soft_wrap=True)
+        for finding in outcome.findings:
+            console.print(finding, markup=False, highlight=False, soft_wrap=True)
         return 1 if outcome.findings else 0
-    deadline = time.time() + 60.0 * options.minutes
-    return play_all(options.seed, options.processes, deadline, options.quick, console)
+    return play_all(options.seed, options.minutes, options.quick, console)
 
 
 if __name__ == "__main__":

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_env.coupling import tip_wrench
 
-# Without an id, all whose steps last one control step.
+# Default: all with control steps as steps.
 IDS = ("SurgSim/Palpate-v0", "SurgSim/Retract-v0", "SurgSim/BimanualRetract-v0")
-# LeRobot's names of what an environment observes, by the names under which LeRobot expects them from an environment.
+# LeRobot's names in data sets, by LeRobot's names in observations of environments.
 NAMES = {"agent_pos": "observation.state", "meta.force_torque": "observation.meta.force_torque"}
 
 
@@ -32,16 +32,16 @@ def observe(env: gym.Env, cameras: list[str]) -> dict[str, Any]:
 
 
 def make_single(env_id: str, cameras: list[str], arguments: dict[str, Any]) -> gym.Env:
-    """One environment as LeRobot plays it."""
+    """One environment for LeRobot."""
     return LeRobotEnv(gym.make(env_id, render_mode="rgb_array", show_force=False, **arguments), cameras)
 
 
 class LeRobotEnv(gym.Wrapper):
-    """An environment that observes what data sets hold (`agents/lerobot_dataset.py`).
+    """An environment with the observations of data sets (`agents/lerobot_dataset.py`).
 
     Args:
         env: made with gym.make.
-        cameras: whose pictures it observes.
+        cameras: of the observed pictures.
     """
 
     def __init__(self, env: gym.Env, cameras: list[str]) -> None:
@@ -59,7 +59,7 @@ class LeRobotEnv(gym.Wrapper):
         return observe(self.env, self.cameras), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment; actions of a network, which may leave [-1, 1], are clipped."""
+        """Step the environment; a network's actions beyond [-1, 1] are clipped."""
         _, reward, terminated, truncated, info = self.env.step(np.clip(action, -1.0, 1.0))
         info = {**info, "is_success": bool(info.get("success", False))}
         return observe(self.env, self.cameras), reward, terminated, truncated, info
@@ -86,7 +86,7 @@ class SurgSimConfig(EnvConfig):
 
     Args:
         task: id of the environment.
-        cameras: whose pictures it observes.
+        cameras: of the observed pictures.
         arguments: of the environment.
     """
 
@@ -122,7 +122,7 @@ class SurgSimConfig(EnvConfig):
 def make_env(
     n_envs: int = 1, use_async_envs: bool = False, cfg: EnvConfig | None = None
 ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-    """Vector environments by id, as LeRobot's EnvHub asks for them.
+    """Vector environments by id, for LeRobot's EnvHub.
 
     Args:
         n_envs: side by side.

@@ -103,10 +103,10 @@ class ClusteredSurface:
         chunk = max(1, PAIRS_AT_ONCE // len(self._cluster_radius))
         for low in range(0, len(near), chunk):
             rows = near[low : low + chunk]
-            result[rows] = self._some(segments[rows], cap)
+            result[rows] = self._near(segments[rows], cap)
         return result
 
-    def _some(self, segments: FloatArray, cap: float) -> FloatArray:
+    def _near(self, segments: FloatArray, cap: float) -> FloatArray:
         to_centre = point_segment_distance(self._cluster_centre[None], segments[:, None])
         # Every ball contains points of the surface: the nearest is no further away than a ball's far side.
         most = np.minimum((to_centre + self._cluster_radius).min(axis=1), cap)
@@ -160,7 +160,7 @@ def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tup
     root = np.sqrt(np.maximum(b * b - a * c, 0.0))
     safe = np.where(a > 0.0, a, 1.0)
     enter = np.where(a > 0.0, (-b - root) / safe, np.where(c < 0.0, -1.0, 2.0))
-    leave = np.where(a > 0.0, (-b + root) / safe, np.where(c < 0.0, 2.0, 2.0))
+    leave = np.where(a > 0.0, (-b + root) / safe, 2.0)
     missed = (b * b - a * c <= 0.0) & (a > 0.0)
     before = np.where(missed, 1.0, np.clip(enter, 0.0, 1.0))
     after = np.where(missed, 1.0, np.clip(leave, 0.0, 1.0))

@@ -61,13 +61,13 @@ class FoundArm:
 
     Fields:
         description: of the arm, for a folder with its TOML file
-        found: findings, a sentence each
+        notes: findings, a sentence each
         chosen: choices for things missing in the file, a sentence each
         reach: share of the places around home (DEPTHS, TILT) in reach of the tip
     """
 
     description: ArmDescription
-    found: list[str]
+    notes: list[str]
     chosen: list[str]
     reach: float
 
@@ -113,7 +113,7 @@ def find_arm(
     Raises:
         ValueError: an unreadable file, an unknown tip, a trocar out of reach.
     """
-    return _Finder(ModelSurvey(path), tip, trocar, tool_length).found
+    return _Finder(ModelSurvey(path), tip, trocar, tool_length).result
 
 
 class _Finder:
@@ -142,7 +142,7 @@ class _Finder:
             )
         arm = self._search_arm(link_shapes)
         home, point, into, reach = self._search_home(arm)
-        self.found = self._finish(link_shapes, home, point, into, reach)
+        self.result = self._finish(link_shapes, home, point, into, reach)
 
     # ---- findings in the file --------------------------------------------------------------------------------
 
@@ -360,7 +360,8 @@ class _Finder:
                 continue
             clouds = [survey.geom_points(geom) for geom in survey.body_geoms(body)]
             # Small parts are markers and jaws; a thin part on what carries the shaft, or beyond, is the shaft.
-            clouds = [c for c in clouds if len(c) and not _is_small(c) and not (beyond and is_shaft(fit_capsule(c)))]
+            clouds = [cloud for cloud in clouds if len(cloud) and float(np.ptp(cloud, axis=0).max()) > SMALL_PART]
+            clouds = [cloud for cloud in clouds if not (beyond and is_shaft(fit_capsule(cloud)))]
             if not clouds:
                 continue
             fitted = fit_capsule(np.concatenate(clouds))
@@ -627,10 +628,6 @@ def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:
 def _added(name: str, body: str, capsule: Capsule) -> AddedShape:
     start, end = vector(capsule.start, 6), vector(capsule.end, 6)
     return AddedShape(name, body, start, round(capsule.radius, 6), None if start == end else end)
-
-
-def _is_small(points: FloatArray) -> bool:
-    return float(np.ptp(points, axis=0).max()) <= SMALL_PART
 
 
 def _figures(values: FloatArray) -> tuple[float, ...]:

@@ -192,11 +192,11 @@ def from_neighbours(kinematics: BatchKinematics, tips: FloatArray, candidates: C
     first = np.where(has, met.argmax(axis=1), 0)
     tree, owners = KDTree(tips[has]), np.flatnonzero(has)
     near = owners[tree.query(tips[need], k=min(NEIGHBOURS, len(owners)))[1].reshape(len(need), -1)]
-    more = from_starts(kinematics, tips[need], candidates.joints[near, first[near]])
+    added = from_starts(kinematics, tips[need], candidates.joints[near, first[near]])
     rows = np.arange(near.shape[1])
     for index, point in enumerate(need):
         for name in vars(candidates):
-            getattr(candidates, name)[point, rows] = getattr(more, name)[index]
+            getattr(candidates, name)[point, rows] = getattr(added, name)[index]
     return candidates
 
 

@@ -110,7 +110,7 @@ class _Search:
             lacking = ~directions_met(candidates.pointing, _every(clear), self.directions)
             wanted = lacking & np.any(candidates.met, axis=1, keepdims=True)
             rows = np.flatnonzero(np.any(wanted, axis=1))
-            more = _empty_like(candidates, self.directions.shape[1])
+            added = _empty_like(candidates, self.directions.shape[1])
             if rows.size:
                 directions, tips = self.directions[rows], self.tips[rows]
                 part = from_directions(
@@ -120,10 +120,10 @@ class _Search:
                     Candidates(*(values[rows] for values in vars(candidates).values())),
                     begin[rows],
                 )
-                for name in vars(more):
-                    getattr(more, name)[rows] = getattr(part, name)
-            clear = np.concatenate([clear, self.clear(more)], axis=2)
-            candidates = candidates.add(more)
+                for name in vars(added):
+                    getattr(added, name)[rows] = getattr(part, name)
+            clear = np.concatenate([clear, self.clear(added)], axis=2)
+            candidates = candidates.add(added)
         return candidates, clear
 
     def clear(self, candidates: Candidates) -> NDArray[np.bool_]:

@@ -31,7 +31,7 @@ def make_env() -> gym.Env:
 
 
 def contact_force() -> slice:
-    """The entries of an observation that are the contact force."""
+    """Entries of the contact force in an observation."""
     env = make_env()
     try:
         return env.unwrapped.observation_slices["contact_force"]  # type: ignore[attr-defined]

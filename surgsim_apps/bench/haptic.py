@@ -1,4 +1,4 @@
-"""Wall-clock time of a haptic step while a scene's organ is pressed."""
+"""Wall-clock time of a haptic step during presses of a scene's organ."""
 
 import time
 

@@ -15,19 +15,19 @@ class Effort:
     """Sizes and repetitions of one run.
 
     Args:
-        blocks: cells along x, y, z of the blocks whose substep is timed.
+        blocks: cells along x, y, z of the blocks for the time of a substep.
         substep_rounds: repetitions of each.
-        scenes: whose haptic step is timed.
+        scenes: for the time of a haptic step.
         haptic_steps: number of steps of each, in contact.
         env_counts: environments side by side.
         control_steps: of every environment in one round.
         control_rounds: repetitions.
-        organ_cells: of this project's block that is pressed beside the peers', cells along x, y, z.
+        organ_cells: of this project's block beside the peers', cells along x, y, z.
         grid: nodes of the peers' block along x, y, z.
         press_rounds: repetitions of each press.
         longer_steps: steps to try with flex, in multiples of 1 ms.
         starts: warm starts.
-        memory_envs: number of environments over which memory is measured.
+        memory_envs: number of environments for the growth of memory.
         rollout_steps: control steps of each environment between two updates of PPO.
         training_rounds: updates of PPO.
     """
@@ -78,7 +78,7 @@ def spread(values: Sequence[float]) -> str:
 
 
 def interleaved(runs: dict[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
-    """The values that each run returns, one a round; runs take turns, so that other load affects all alike."""
+    """Values of each run, one a round; runs take turns, so that other load affects all alike."""
     results: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
         for name, run in runs.items():
@@ -87,12 +87,12 @@ def interleaved(runs: dict[str, Callable[[], float]], rounds: int) -> dict[str, 
 
 
 def seconds_per_call(call: Callable[[int], object]) -> float:
-    """Processor time of one of `count` repetitions that call(count) makes [s], with a count that lasts long enough."""
+    """Processor time of one of `count` repetitions by call(count) [s], with a count of at least SHORTEST_TIMING."""
     count = 1
     while True:
         begin = time.process_time()
         call(count)
-        taken = time.process_time() - begin
-        if taken >= SHORTEST_TIMING:
-            return taken / count
-        count = max(2 * count, min(10 * count, math.ceil(1.2 * count * SHORTEST_TIMING / max(taken, 1e-6))))
+        elapsed = time.process_time() - begin
+        if elapsed >= SHORTEST_TIMING:
+            return elapsed / count
+        count = max(2 * count, min(10 * count, math.ceil(1.2 * count * SHORTEST_TIMING / max(elapsed, 1e-6))))

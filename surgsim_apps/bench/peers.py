@@ -1,4 +1,4 @@
-"""Other simulators at the press: MuJoCo's own deformable bodies (flexcomp), and Newton, which is optional.
+"""Other simulators at the press: MuJoCo's own deformable bodies (flexcomp), and optionally Newton.
 
 Flex is full or trilinear, implicit or explicit; Newton (the `newton` package, on the CPU) has an explicit solver and
 vertex block descent.
@@ -32,18 +32,18 @@ from surgsim_apps.bench.presses import (
 )
 from surgsim_apps.bench.report import AbsentError
 
-# Half thickness of flex vertices, radius of a particle [m]: the ball meets the surface higher by this.
+# Half thickness of flex vertices, radius of a particle [m]; the ball's surface is higher by this at contact.
 SKIN = 0.0005
 # The hardest contact without noise: penetration stays below 0.05 mm.
 FLEX_CONTACT = 'condim="1" solref="0.002 1" solimp="0.99 0.999 0.0001"'
 NEWTON_CONTACT = 2e3  # [N/m] per particle; penetration 0.05 mm
 SMITH = MODULUS / (2.0 * (1.0 + POISSON))
 LAME = MODULUS * POISSON / ((1.0 + POISSON) * (1.0 - 2.0 * POISSON))
-# Explicit steps that are tried for flex's default integrator [s], the longest first, and its elastic damping [s]: the
-# implicit one's would ask for far shorter steps.
+# Explicit steps to be tried for flex's default integrator [s], the longest first, and its elastic damping [s]: that of
+# the implicit one needs far shorter steps.
 EXPLICIT_STEPS = (5e-4, 2e-4, 1e-4, 5e-5)
 EXPLICIT_DAMPING = 0.0003
-# Longer implicit steps need more iterations than the default lets them have.
+# Longer implicit steps need more iterations than the default.
 LONG_ITERATIONS = 1000
 MODEL = """<mujoco>
 <option timestep="{dt}" integrator="{integrator}" solver="CG" iterations="{iterations}" tolerance="1e-8"
@@ -77,7 +77,7 @@ class Flex:
     iterations: int = 100
 
     def contender(self) -> Contender:
-        """This setting, compiled and ready to press; AbsentError where MuJoCo refuses it."""
+        """This setting, compiled and ready to press; AbsentError if MuJoCo refuses it."""
         kind = "full" if self.trilinear is None else "trilinear " + "x".join(map(str, self.trilinear))
         try:
             model = self._compile()
@@ -131,16 +131,16 @@ def _warning(data: mujoco.MjData) -> str:
 
 
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
-    """Sum of all contact forces of the last step [N], shape (3,): the ball is the only thing that is touched."""
-    total, one = np.zeros(3), np.zeros(6)
+    """Sum of all contact forces of the last step [N], shape (3,), all of them on the ball."""
+    total, wrench = np.zeros(3), np.zeros(6)
     for number in range(data.ncon):
-        mujoco.mj_contactForce(model, data, number, one)
-        total += data.contact[number].frame.reshape(3, 3).T @ one[:3]
+        mujoco.mj_contactForce(model, data, number, wrench)
+        total += data.contact[number].frame.reshape(3, 3).T @ wrench[:3]
     return total
 
 
 def longest_stable(settings: "Iterable[Flex | Newton]") -> Contender:
-    """The first of some settings, the longest step first, that bears the press; its setting says what was tried."""
+    """The first stable setting in the press, of those with the longest step first; it lists the tried ones."""
     tried: list[str] = []
     for setting in settings:
         contender = setting.contender()
@@ -153,7 +153,7 @@ def longest_stable(settings: "Iterable[Flex | Newton]") -> Contender:
 
 
 def fastest_within(base: Flex, force: float, steps: tuple[int, ...], share: float) -> tuple[Flex | None, list[str]]:
-    """`base` at the step that takes least time while its force stays within a share of a force, and all that was tried.
+    """`base` at its fastest step with a force within a share of `force`, and a text on each tried step.
 
     The steps are multiples of `base`'s, tried once each.
     """
@@ -183,7 +183,7 @@ class Newton:
     damping: float = 1.0
 
     def contender(self) -> Contender:
-        """Ready to press; AbsentError where Newton is not installed."""
+        """Ready to press; AbsentError without Newton."""
         newton, wp = modules()
         with wp.ScopedDevice("cpu"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -251,11 +251,11 @@ class Newton:
                 self._place(now, then, ball, (place, place, height), step)
                 now.clear_forces()
                 pipeline.collide(now, contacts)
-                given = {} if force is None else {"observables": force if step == steps - 1 else None}
-                solver.step(now, then, control, contacts, self.dt, **given)
+                options = {} if force is None else {"observables": force if step == steps - 1 else None}
+                solver.step(now, then, control, contacts, self.dt, **options)
                 now, then = then, now
             times = clock.read()
-            # After the swap `then` is the state whose forces made the last step.
+            # After the swap `then` is the state with the forces of the last step.
             total = then.body_f.numpy()[ball, 2] if force is None else force.contact_f.numpy()[:, 2].sum()
         fault = _fault(now.particle_q.numpy(), model.tet_indices.numpy())
         if fault or not math.isfinite(total):
@@ -270,9 +270,9 @@ class Newton:
 
 
 def _fault(points: Any, tets: Any) -> str:
-    """What is wrong with a state: numbers that are not finite, tets inside out; "" where nothing is.
+    """Fault of a state: numbers not finite, tets inside out; "" without one.
 
-    The explicit solver says nothing when its step is too long: what it has left may be finite, and means nothing.
+    The explicit solver is silent about a too long step: its result may be finite, and means nothing.
     """
     if not np.isfinite(points).all():
         return "positions are not finite"
@@ -282,11 +282,11 @@ def _fault(points: Any, tets: Any) -> str:
 
 
 def modules() -> tuple[Any, Any]:
-    """`newton` and `warp`; AbsentError where they are not installed."""
+    """`newton` and `warp`; AbsentError without them."""
     try:
         wp = import_module("warp")
-        # Warnings and worse: not the machine's devices, nor each module that is compiled.
+        # Warnings and worse: not the machine's devices, nor each compiled module.
         wp.config.log_level = max(wp.config.log_level, 30)
         return import_module("newton"), wp
-    except ImportError as why:
-        raise AbsentError(f"not installed ({why}): pip install 'surgsim[bench]'") from None
+    except ImportError as error:
+        raise AbsentError(f"not installed ({error}): pip install 'surgsim[bench]'") from None

@@ -1,4 +1,4 @@
-"""The press on which simulators are compared, a ball on a bonded block: reference force and this project's press."""
+"""The press for comparing simulators, a ball on a bonded block: reference force and this project's press."""
 
 import time
 from collections.abc import Callable
@@ -20,12 +20,12 @@ SIZE = (0.06, 0.06, 0.03)  # [m] of the block, x and y around 0, bottom at z = 0
 MODULUS, POISSON, DENSITY = 5000.0, 0.45, 1060.0
 RADIUS, DEPTH = 0.008, 0.004  # [m] of the ball, of the press
 SPEED, HOLD = 0.04, 0.1  # [m/s] on the way in, [s] at depth
-# Where the ball is pressed: over the block's middle, and half a cell of the simulator's own mesh to its side.
+# Places of the ball: over the block's middle, and half a cell of the simulator's own mesh to its side.
 PLACES = (0.0, 0.5)
 
 
 class DivergedError(Exception):
-    """A peer's simulation diverged; the message says how."""
+    """Divergence of a peer's simulation, with details in the message."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Pressed:
 
 
 class Clock:
-    """Wall clock and processor time since it was made."""
+    """Wall clock and processor time since its construction."""
 
     def __init__(self) -> None:
         self._begin = time.perf_counter(), time.process_time()
@@ -53,8 +53,8 @@ class Clock:
 class Contender:
     """A simulator at one setting: its name, its settings and mesh in words, and its press.
 
-    `press(offset)` takes the ball's place in cells of its own mesh, the same along x and y. `contact` is the stiffness
-    of contact [N/m^3] of the reference that its force is compared with.
+    `press(offset)` takes the ball's place in cells of its own mesh, the same along x and y. `contact` is the contact
+    stiffness of the reference for its force [N/m^3].
     """
 
     name: str

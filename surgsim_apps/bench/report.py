@@ -1,4 +1,4 @@
-"""The report of a benchmark run: figures in sections, the machine that they were measured on, the page."""
+"""The report of a benchmark run: figures in sections, their machine, the page."""
 
 import os
 import platform
@@ -23,11 +23,11 @@ Written by `surgsim bench{quick}`. Times hold for this machine and this run; com
 
 
 class AbsentError(Exception):
-    """Something that this run cannot measure, such as a peer that is not installed; the message says why."""
+    """An impossible measurement, such as a peer without an installation; the message gives the reason."""
 
 
 def processor() -> str:
-    """The processor's name, as far as the system states it."""
+    """The processor's name, from the system if it is known there."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
         for line in cpuinfo.read_text(encoding="utf-8").splitlines():
@@ -37,7 +37,7 @@ def processor() -> str:
 
 
 def registers() -> str:
-    """The vector registers that compiled code uses here, and what it works on at a time."""
+    """Vector registers of compiled code on this machine, and their contents."""
     doubles, singles = (" or ".join(map(str, lane_counts(dtype))) for dtype in (np.float64, np.float32))
     return (
         f"vector registers of {register_bits()} bits; {GROUP} springs or tets of an organ alone at a time, or one of "
@@ -72,7 +72,7 @@ def describe(load_before: str) -> str:
 
 @dataclass(frozen=True)
 class Figure:
-    """One number with its case, quantity and unit; None where it could not be measured, and then `note` says why."""
+    """One number with its case, quantity and unit; None for an impossible measurement, with the reason in `note`."""
 
     case: str
     quantity: str
@@ -116,9 +116,9 @@ class Section:
         return "\n".join(lines) + (f"\n\n{self.closing}" if self.closing else "") + "\n"
 
 
-def absent(case: str, quantity: str, unit: str, why: object) -> Figure:
-    """A figure that could not be measured, with the reason in one line."""
-    return Figure(case, quantity, None, unit, " ".join(str(why).split()))
+def absent(case: str, quantity: str, unit: str, reason: object) -> Figure:
+    """A figure without a measurement, with the reason in one line."""
+    return Figure(case, quantity, None, unit, " ".join(str(reason).split()))
 
 
 def write_report(sections: Sequence[Section], machine: str, folder: OutputFolder, *, quick: bool) -> None:

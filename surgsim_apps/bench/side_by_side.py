@@ -12,9 +12,9 @@ from surgsim_apps.validation.elements import has_fem
 
 # Flex at its own fastest step stays within this share of its force at 1 ms.
 SHARE = 0.02
-# A round that takes longer than this [s] is not repeated.
+# Longest repeated round [s].
 LONGEST_ROUND = 60.0
-NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] the explicit solver's, the longest that is stable in the press is used
+NEWTON_STEPS = (5e-4, 2e-4, 1e-4)  # [s] of the explicit solver; the longest stable one is used
 METHOD = """One press of a frictionless ball of 8 mm radius, 4 mm deep at 40 mm/s, then 0.1 s of rest, on a block of 60
 x 60 x 30 mm, E 5 kPa, nu 0.45, density 1060, bottom held, no gravity; one thread each, same process, in turn in each
 round. `wall` and `processor` are seconds per simulated second (1 is real time), medians; `ratio` is processor time
@@ -58,7 +58,7 @@ class Tally:
 
 
 def measure(effort: Effort) -> Section:
-    """All contenders that are installed, round by round; the others are listed with the reason."""
+    """All installed contenders, round by round; the others are listed with the reason."""
     references = "scikit-fem is absent, no error is given"
     if has_fem():
         references = f"{reference_force(organ_press(effort.organ_cells).contact):.4f} N with this project's contact "
@@ -70,8 +70,8 @@ def measure(effort: Effort) -> Section:
     for name, make in peers(effort):
         try:
             tallies.append(Tally(make()))
-        except (AbsentError, DivergedError) as why:
-            section.figures.append(absent(name, *WALL, why))
+        except (AbsentError, DivergedError) as error:
+            section.figures.append(absent(name, *WALL, error))
     for _ in range(effort.press_rounds):
         for tally in tallies:
             tally.press()
@@ -93,13 +93,13 @@ def peers(effort: Effort) -> Iterator[tuple[str, Callable[[], Contender]]]:
 
 
 def _fastest(grid: Cells, effort: Effort) -> Contender:
-    """Flex at the fastest step whose force stays near that at 1 ms."""
+    """Flex at its fastest step with a force near that at 1 ms."""
     base = Flex(grid)
     best, tried = fastest_within(base, base.contender().press(0.0).force, effort.longer_steps, SHARE)
     if best is None:
         raise AbsentError(f"no longer step stays within {100 * SHARE:g} %: {'; '.join(tried)}")
-    found, name = best.contender(), f"MuJoCo flex full, discrete, fastest step, {1e3 * best.dt:g} ms"
-    return replace(found, name=name, setting=f"{found.setting}; against 1 ms: {', '.join(tried)}")
+    contender, name = best.contender(), f"MuJoCo flex full, discrete, fastest step, {1e3 * best.dt:g} ms"
+    return replace(contender, name=name, setting=f"{contender.setting}; against 1 ms: {', '.join(tried)}")
 
 
 def _figures(tally: Tally, own: Tally) -> list[Figure]:
@@ -108,7 +108,7 @@ def _figures(tally: Tally, own: Tally) -> list[Figure]:
         return [absent(contender.name, *WALL, f"{tally.fault}; {contender.setting}")]
     processor = median(tally.processors)
     force = sum(tally.forces.values()) / len(tally.forces)
-    places = " and ".join(f"{one:.4f}" for one in tally.forces.values())
+    places = " and ".join(f"{value:.4f}" for value in tally.forces.values())
     note = f"{contender.mesh}; {contender.setting}; force {places} N; processor {spread(tally.processors)} s/s"
     figures = [
         Figure(contender.name, WALL[0], median(tally.walls), WALL[1], note),

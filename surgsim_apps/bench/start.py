@@ -11,7 +11,7 @@ from surgsim_apps.bench.measurement import Effort, spread
 from surgsim_apps.bench.report import Figure, Section, absent
 
 SCENE = "phantom"
-# A process that hangs is stopped after this time [s].
+# Longest time of a process [s].
 LIMIT = 600.0
 METHOD = f"""Start is from the first import to the end of the first `step` of `SurgSim/Palpate-v0` on `{SCENE}`; cold
 is with an empty numba cache, warm with a full one; reset is the median of seven. Memory is the growth of the process

@@ -1,4 +1,4 @@
-"""Time of one substep of an organ: against its number of nodes, and with springs that stiffen and relax."""
+"""Time of one substep of an organ: against its number of nodes, and with stiffening and relaxing springs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,17 +17,17 @@ from surgsim_apps.bench.measurement import Cells, Effort, exponent, interleaved,
 from surgsim_apps.bench.report import Figure, Section
 
 CELL = 0.005  # [m]
-# The exponent is that of blocks with at least this number of nodes: in smaller ones calls and start-up dominate.
+# Fewest nodes of a block for the exponent: in smaller ones calls and start-up dominate.
 LEAST_NODES = 600
 METHOD = """Blocks of cubic 5 mm cells, E 5 kPa, nu 0.45, springs and volume term, no contact, one thread, bottom held,
 slightly sheared. Processor time per substep and organ; medians, all sizes in turn in each round. "Abreast" are organs
 side by side in lanes (vectorised). A node or spring update is one node or spring in one substep."""
 
-# The block of phantom's size whose springs stiffen and relax, and how it is timed: Maxwell arms give way once a
-# millisecond, so that all laws need the same step.
+# The block for the laws, of phantom's size, with its shears and step: Maxwell arms relax once a millisecond, so that
+# all laws need the same step.
 LAW_CELLS = (12, 12, 6)
 LAW_SHEARS, LAW_STEP = (0.03, 0.1), 0.00025
-# A sheared block swings back: it is sheared anew after so many substeps.
+# A sheared block swings back: substeps until it is sheared anew.
 SUBSTEPS_SHEARED = 16
 TISSUE = Material(5000.0, 1060.0, 0.45)
 STIFFENING = Stiffening(onset_strain=0.05, cap_strain=0.2, tangent_cap=20.0)
@@ -54,7 +54,7 @@ def block(cells: Cells, material: Material = TISSUE) -> OrganModel:
 
 
 def single(model: OrganModel, *, shear: float = 0.01, dt: float | None = None) -> Substep:
-    """Seconds of one substep of one organ, float64, sheared; dt [s] is half of the stable step unless it is given."""
+    """Seconds of one substep of one organ, float64, sheared; dt [s] is by default half of the stable step."""
     state = rest_state(model)
     dt = 0.5 * model.stable_step if dt is None else dt
     wrench = np.zeros((0, 6))
@@ -139,7 +139,7 @@ def measure_laws(effort: Effort) -> Section:
             for name in LAWS:
                 row = f"{name}, sheared by {shear:g}"
                 values = times[f"{way} {row}"]
-                note = f"{way}: {spread([1e6 * one for one in values])}"
+                note = f"{way}: {spread([1e6 * value for value in values])}"
                 section.figures.append(Figure(row, way, 1e6 * median(values), "us", note))
                 section.figures.append(Figure(row, f"ratio, {way}", median(values) / linear, "1"))
     return section
@@ -148,7 +148,7 @@ def measure_laws(effort: Effort) -> Section:
 def _figures(way: str, name: str, model: OrganModel, times: list[float]) -> list[Figure]:
     """Cost and rates of one block."""
     cost, nodes, springs = median(times), len(model.node_mass), len(model.spring_stiffness)
-    note = f"{springs} springs, {len(model.tet_nodes)} tets; {way}: {spread([1e6 * one for one in times])}"
+    note = f"{springs} springs, {len(model.tet_nodes)} tets; {way}: {spread([1e6 * value for value in times])}"
     return [
         Figure(name, way, 1e6 * cost, "us", note),
         Figure(name, f"node updates, {way}", 1e-6 * nodes / cost, "1e6/s"),
@@ -157,7 +157,7 @@ def _figures(way: str, name: str, model: OrganModel, times: list[float]) -> list
 
 
 def _growth(way: str, costs: dict[int, float]) -> list[Figure]:
-    """The exponent of cost against nodes, where there are two blocks that are large enough."""
+    """The exponent of cost against nodes, if two blocks are large enough."""
     sizes = [nodes for nodes in costs if nodes >= LEAST_NODES]
     if len(sizes) < 2:
         return []

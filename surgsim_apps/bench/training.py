@@ -1,4 +1,4 @@
-"""Control steps a second while PPO learns: environments side by side, the policy's actions and its updates."""
+"""Control steps a second during learning with PPO: vectorised environments, the policy's actions and its updates."""
 
 import time
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ WALL, PROCESSOR = "wall", "processor"
 
 @dataclass(frozen=True)
 class Training:
-    """An environment to learn, and the kind of policy that reads it.
+    """An environment to learn, and the kind of its policy.
 
     Args:
         case: its name in the report.
@@ -39,7 +39,7 @@ class Training:
     policy: str
 
     def envs(self) -> gym.vector.VectorEnv:
-        """The environments, which reset in the step in which an episode ends."""
+        """The environments, with resets in the last step of an episode."""
         lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": "float32"}
         return gym.make_vec(self.env_id, LANES, **lanes, **self.settings)
 
@@ -57,14 +57,14 @@ TRAININGS = (
 
 
 class Clock:
-    """Rates of control steps since it was made, or since the last round: per second of wall clock and processor."""
+    """Rates of control steps in each round, per second of wall clock and of processor time."""
 
     def __init__(self) -> None:
         self.rates: dict[str, list[float]] = {WALL: [], PROCESSOR: []}
         self._begin = time.perf_counter(), time.process_time()
 
     def end_round(self, steps: int) -> None:
-        """Note the rates of a round of so many control steps, and begin the next."""
+        """Note the rates of a round of control steps, and begin the next."""
         now = time.perf_counter(), time.process_time()
         for rates, then, last in zip(self.rates.values(), now, self._begin, strict=True):
             rates.append(steps / (then - last))
@@ -72,19 +72,19 @@ class Clock:
 
 
 def measure(effort: Effort) -> Section:
-    """Rates of each training, without and with PPO; what cannot run is listed with the reason."""
+    """Rates of each training, without and with PPO; absent ones are listed with the reason."""
     method = METHOD.format(cores=core_count(), steps=effort.rollout_steps)
     section = Section("training", "Control steps a second while PPO learns", method)
     for training in TRAININGS:
         for doing, run in (("stepping", step), ("PPO", learn)):
             try:
                 clock = run(training, effort)
-            except AbsentError as why:
-                section.figures.append(absent(training.case, f"{doing}, {WALL}", "1/s", why))
+            except AbsentError as error:
+                section.figures.append(absent(training.case, f"{doing}, {WALL}", "1/s", error))
                 continue
             for kind, rates in clock.rates.items():
-                told = f"{doing}, {kind}: {spread(rates)}"
-                section.figures.append(Figure(training.case, f"{doing}, {kind}", median(rates), "1/s", told))
+                note = f"{doing}, {kind}: {spread(rates)}"
+                section.figures.append(Figure(training.case, f"{doing}, {kind}", median(rates), "1/s", note))
     return section
 
 
@@ -92,7 +92,7 @@ def step(training: Training, effort: Effort) -> Clock:
     """Step the environments with random actions.
 
     Raises:
-        AbsentError: their pictures need OpenGL, which is not here.
+        AbsentError: pictures without OpenGL.
     """
     envs = training.envs()
     try:
@@ -113,7 +113,7 @@ def learn(training: Training, effort: Effort) -> Clock:
     """Let PPO learn, a round for each update.
 
     Raises:
-        AbsentError: stable-baselines3, or OpenGL for pictures, is not here.
+        AbsentError: no stable-baselines3, or no OpenGL for pictures.
     """
     try:
         from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
@@ -135,7 +135,7 @@ def learn(training: Training, effort: Effort) -> Clock:
             seed=0,
             device="cpu",
         )
-        # The first update sets up what the later ones find.
+        # The first update includes one-off preparations.
         model.learn(steps)
         clock = Clock()
         for _ in range(effort.training_rounds):
@@ -147,7 +147,7 @@ def learn(training: Training, effort: Effort) -> Clock:
 
 
 def _begin(envs: gym.vector.VectorEnv) -> None:
-    """A first step, which compiles, and opens the graphics."""
+    """A first step, for compiling and opening the graphics."""
     try:
         envs.reset(seed=0)
     except NoGLError as none:

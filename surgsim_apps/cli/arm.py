@@ -109,7 +109,7 @@ class Arm:
                 trocar=vector_of("--trocar", self.trocar),
                 tool_length=self.tool,
             )
-        for sentence in arm_model.found:
+        for sentence in arm_model.notes:
             console.print(f"found: {sentence}", highlight=False, soft_wrap=True)
         for sentence in arm_model.chosen:
             console.print(f"warning: {sentence}", highlight=False, soft_wrap=True, style="yellow")
@@ -117,7 +117,7 @@ class Arm:
         description = replace(arm_model.description, model=Path(model).as_posix())
         head = (
             f"Written by `surgsim arm check` from {self.file.name}; docs/arms.md explains every entry.",
-            *(f"Found: {sentence}." for sentence in arm_model.found),
+            *(f"Found: {sentence}." for sentence in arm_model.notes),
             *(f"Chosen: {sentence}." for sentence in arm_model.chosen),
         )
         arm = load_arm(arm_model.description)

@@ -104,10 +104,10 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
                 f"recording {path} has no column {name!r}; the needed ones are {', '.join(NEEDED)}, and it has "
                 f"{', '.join(header) or 'none'}"
             )
-    given = [name for name in PLACE if name in header]
-    if given and len(given) < len(PLACE):
-        raise ValueError(f"recording {path} has {', '.join(given)} of {', '.join(PLACE)}: give all three or none")
-    known = (*NEEDED, *given, *([TIME] if TIME in header else []))
+    places = [name for name in PLACE if name in header]
+    if places and len(places) < len(PLACE):
+        raise ValueError(f"recording {path} has {', '.join(places)} of {', '.join(PLACE)}: give all three or none")
+    known = (*NEEDED, *places, *([TIME] if TIME in header else []))
     return {name: header.index(name) for name in known}
 
 

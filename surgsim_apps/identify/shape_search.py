@@ -302,14 +302,14 @@ def _intervals(
         for value in grid:
             nearest = candidates[np.argsort(np.abs(candidates[:, axis] - value))[:PROFILE_CANDIDATES]]
             # Candidates nearest to the value, and points around the best shape.
-            tried = np.concatenate([[point], nearest, np.clip(point + 0.3 * (nearest - 0.5), 0.0, 1.0)])
-            tried[:, axis] = value
-            errors = site_errors(library.interpolated(tried), parts)
+            points = np.concatenate([[point], nearest, np.clip(point + 0.3 * (nearest - 0.5), 0.0, 1.0)])
+            points[:, axis] = value
+            errors = site_errors(library.interpolated(points), parts)
             chosen = int(trimmed_mean(errors).argmin())
             difference = errors[chosen] - reference
             scatter = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.inf
             if difference.mean() <= STANDARD_ERRORS * scatter:
-                accepted.append(tried[chosen])
+                accepted.append(points[chosen])
     shapes = [space.shape(point) for point in accepted]
     intervals = {}
     for name in NAMES[len(NAMES) - space.dimension :]:

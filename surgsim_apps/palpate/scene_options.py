@@ -50,13 +50,13 @@ def check_options(options: SceneOptions) -> None:
     """Refuse a length or modulus that is not above 0, and a direction without length."""
     if options.approach is not None:
         _direction(options.approach)
-    given = {
+    values = {
         "press depth": options.press_depth,
         "tip radius": options.tip_radius,
         "spacing": options.spacing,
         "Young's modulus": options.youngs_modulus,
     }
-    for name, value in given.items():
+    for name, value in values.items():
         if value is not None and not 0.0 < value < math.inf:
             unit = "Pa" if "modulus" in name else "metres"
             raise ValueError(f"{name} is {value:g}; it must be finite and above 0 ({unit})")

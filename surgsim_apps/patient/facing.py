@@ -35,10 +35,10 @@ def facing_approach(patient: PatientMesh, usual: Vector, face_angle_deg: float) 
     between = (inward[:, None] + inward[None]).reshape(-1, 3)
     length = norm(between, axis=1)
     between = between[length > ROUNDING] / length[length > ROUNDING, None]
-    tried = np.concatenate([first[None], between, _sphere()])
-    faced = (matmul(tried, inward.T) >= least).sum(axis=1)
+    candidates = np.concatenate([first[None], between, _sphere()])
+    faced = (matmul(candidates, inward.T) >= least).sum(axis=1)
     best = np.flatnonzero(faced == faced.max())
-    chosen = tried[best[int(np.argmax(matmul(tried[best], first)))]]
+    chosen = candidates[best[int(np.argmax(matmul(candidates[best], first)))]]
     x, y, z = chosen.tolist()
     return x, y, z
 
@@ -50,9 +50,9 @@ def faced_note(patient: PatientMesh, scene: Scene) -> list[str]:
     hidden = [name for name, cosine in zip(patient.lesions, cosines) if cosine < cos(np.radians(angle))]
     if not hidden:
         return []
-    given = ", ".join(f"{part:.2f}" for part in scene.instrument.approach)
+    approach = ", ".join(f"{part:.2f}" for part in scene.instrument.approach)
     return [
-        f"the approach {given} does not face {', '.join(hidden)}: the nearest surface is turned away by over "
+        f"the approach {approach} does not face {', '.join(hidden)}: the nearest surface is turned away by over "
         f"{angle:g} degrees; it may not be felt (--approach)"
     ]
 

@@ -41,6 +41,8 @@ from surgsim_env.palpation import healthy_file, write_healthy_map
 from surgsim_env.scene import load_scene, make_scene, share_text, warn_of_coarse_cells, with_added_mass
 from surgsim_env.step_progress import StepProgress
 
+# Contents of an organ's files.
+OrganContents = LabelImage | PatientSurfaces | PatientTets
 MESHERS = ("lattice", "tetwild")
 REPORT_NAME = "report.html"
 
@@ -93,16 +95,17 @@ def make_patient(
         if labels is None:
             raise ValueError(f"{first}: which labels are the organ? Give {FORM}")
         with progress.step(f"reading {first.name}"):
-            given = read_label_image(first, parse_labels(labels))
-        name, volume = given.names[0], image_volume(given)
+            contents = read_label_image(first, parse_labels(labels))
+        name, volume = contents.names[0], image_volume(contents)
     elif first.suffix.lower() in FORMATS:
         if len(files) > 1:
             raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
         with progress.step(f"reading {first.name}"):
-            given = read_tets(first, length_unit, parse_labels(labels) if labels is not None else ())
+            contents = read_tets(first, length_unit, parse_labels(labels) if labels is not None else ())
             if remesh:
-                given = surfaces_of_tets(given)
-        name, volume = given.organ.name if isinstance(given, PatientSurfaces) else given.names[0], given.volume
+                contents = surfaces_of_tets(contents)
+        name = contents.organ.name if isinstance(contents, PatientSurfaces) else contents.names[0]
+        volume = contents.volume
     else:
         wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
         if wrong:
@@ -112,28 +115,28 @@ def make_patient(
                 f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
             )
         with progress.step(f"reading {first.name}"):
-            given = read_surfaces(files, length_unit, mend=mend)
-        name, volume = given.organ.name, given.volume
+            contents = read_surfaces(files, length_unit, mend=mend)
+        name, volume = contents.organ.name, contents.volume
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
-    if isinstance(given, PatientTets):
+    if isinstance(contents, PatientTets):
         touch = replace(
-            plan_touch(volume, options, cell_size=given.face_cell(approach, angle), graded=False),
-            known_node_count=given.mesh.node_count,
+            plan_touch(volume, options, cell_size=contents.face_cell(approach, angle), graded=False),
+            known_node_count=contents.mesh.node_count,
         )
     else:
         touch = plan_touch(volume, options, cell_size=cell_size, graded=mesher == MESHERS[0])
     progress.say(plan_text(touch, organ_material(name, options.youngs_modulus).material, approach))
     cells = Cells(touch.cell_size, touch.is_given, touch.coarsening, touch.fine_depth, approach, angle)
-    if options.approach is None and touch.coarsening > 1 and _has_lesions(given):
+    if options.approach is None and touch.coarsening > 1 and _has_lesions(contents):
         # The lesions decide the probe's approach, and that the place of the fine cells.
         with progress.step("turning the probe to the lesions"):
             rough = replace(cells, size=touch.coarsening * touch.cell_size, is_given=True, coarsening=1)
-            approach = facing_approach(_meshed(given, first.name, rough, mesher, mend), approach, angle)
+            approach = facing_approach(_meshed(contents, first.name, rough, mesher, mend), approach, angle)
         options, cells = replace(options, approach=approach), replace(cells, approach=approach)
     with progress.step("filling it with tets"):
-        mesh = _meshed(given, first.name, cells, mesher, mend)
+        mesh = _meshed(contents, first.name, cells, mesher, mend)
     with progress.step("fitting its own surface to the tets"):
-        mesh = replace(mesh, surface=_own_surface(given, mesh, mend))
+        mesh = replace(mesh, surface=_own_surface(contents, mesh, mend))
     with progress.step("choosing sites, lesions and the step"):
         return patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
 
@@ -148,25 +151,25 @@ def with_hold(organ: PatientScene, progress: StepProgress) -> PatientScene:
     return replace(organ, hold=hold, notes=(*organ.notes, *faults))
 
 
-def _meshed(
-    given: LabelImage | PatientSurfaces | PatientTets, source: str, cells: Cells, mesher: str, mend: bool
-) -> PatientMesh:
-    if isinstance(given, PatientTets):
-        return patient_of_tets(given, cells.size)
-    if isinstance(given, PatientSurfaces):
-        return mesh_surfaces(given, cells=cells, mesher=mesher)
-    return mesh_image(given, source, cells=cells, mesher=mesher, mend=mend)
+def _meshed(contents: OrganContents, source: str, cells: Cells, mesher: str, mend: bool) -> PatientMesh:
+    if isinstance(contents, PatientTets):
+        return patient_of_tets(contents, cells.size)
+    if isinstance(contents, PatientSurfaces):
+        return mesh_surfaces(contents, cells=cells, mesher=mesher)
+    return mesh_image(contents, source, cells=cells, mesher=mesher, mend=mend)
 
 
-def _own_surface(given: LabelImage | PatientSurfaces | PatientTets, mesh: PatientMesh, mend: bool) -> SurfaceFit | None:
+def _own_surface(contents: OrganContents, mesh: PatientMesh, mend: bool) -> SurfaceFit | None:
     """Surface for pictures; None for tets of a file, whose boundary is the organ's surface."""
-    if isinstance(given, PatientTets):
+    if isinstance(contents, PatientTets):
         return None
-    return file_surface(given, mesh) if isinstance(given, PatientSurfaces) else image_surface(given, mesh, mend=mend)
+    if isinstance(contents, PatientSurfaces):
+        return file_surface(contents, mesh)
+    return image_surface(contents, mesh, mend=mend)
 
 
-def _has_lesions(given: LabelImage | PatientSurfaces | PatientTets) -> bool:
-    names = [region.name for region in given.inner] if isinstance(given, PatientSurfaces) else given.names[1:]
+def _has_lesions(contents: OrganContents) -> bool:
+    names = [region.name for region in contents.inner] if isinstance(contents, PatientSurfaces) else contents.names[1:]
     return any(map(is_lesion, names))
 
 

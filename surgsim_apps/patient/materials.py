@@ -90,9 +90,9 @@ def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping
         organ: material of that organ.
         moduli: given on the command line, by the region's name with or without its number [Pa].
     """
-    given = moduli.get(name, moduli.get(without_number(name)))
-    if given is not None:
-        modulus, source = given, GIVEN
+    modulus = moduli.get(name, moduli.get(without_number(name)))
+    if modulus is not None:
+        source = GIVEN
     elif is_lesion(name):
         ratio, source = KIDNEY_LESION if "kidney" in organ_name.lower() else LESIONS["lesion"]
         for word, entry in LESIONS.items():

@@ -269,15 +269,15 @@ def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool)
     return PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files), tuple(dropped))
 
 
-def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
+def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
     """Mesh of closed surfaces, in the files' own axes.
 
     Args:
-        given: the surfaces.
+        surfaces: of the organ and its regions.
         cells: of the mesh.
         mesher: "lattice" or "tetwild".
     """
-    organ, inner = given.organ, given.inner
+    organ, inner = surfaces.organ, surfaces.inner
     names = [organ.name, *(surface.name for surface in inner)]
     graded: dict[str, Any] = {}
     if cells.coarsening > 1 and isinstance(organ, ClosedSurface):
@@ -285,7 +285,7 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
         graded = {"fine_triangles": facing, "fine_depth": cells.fine_depth}
 
     def make(cell_size: float) -> PatientMesh:
-        notes = list(given.notes)
+        notes = list(surfaces.notes)
         if isinstance(organ, BrokenSurface):
             tags, step, start, note = mended_voxels(organ, cell_size)
             notes.append(note)
@@ -311,7 +311,7 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
             coarsening=1 if mesher == "tetwild" else cells.coarsening,
             mesher="lattice" if isinstance(organ, BrokenSurface) else mesher,
             convention=FILE_CONVENTION,
-            sources=given.sources,
+            sources=surfaces.sources,
             notes=tuple(notes),
             is_scan=False,
         )
@@ -319,9 +319,9 @@ def mesh_surfaces(given: PatientSurfaces, *, cells: Cells, mesher: str) -> Patie
     return well_shaped(make, cells)
 
 
-def file_surface(given: PatientSurfaces, mesh: PatientMesh) -> SurfaceFit:
+def file_surface(surfaces: PatientSurfaces, mesh: PatientMesh) -> SurfaceFit:
     """Surface of an organ's file, or rebuilt from voxels if it is broken, fitted to its mesh."""
-    organ = given.organ
+    organ = surfaces.organ
     if isinstance(organ, ClosedSurface):
         return fitted_surface(organ.vertices, organ.triangles, mesh.mesh, mesh.cell_size)
     tags, step, start, _ = mended_voxels(organ, mesh.cell_size)

@@ -97,39 +97,39 @@ def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[Label
     return PatientTets(in_sweep_order(TetMesh(mesh.points, mesh.tets, tags, names)), file.name)
 
 
-def patient_of_tets(given: PatientTets, cell_size: float) -> PatientMesh:
+def patient_of_tets(tets: PatientTets, cell_size: float) -> PatientMesh:
     """Organ with the tets of a file, with cells of a size at the pressed face [m]."""
-    mesh, names = given.mesh, given.names
+    mesh, names = tets.mesh, tets.names
     volumes = {tag: float(mesh.volumes[mesh.region == tag].sum()) for tag, _ in mesh.region_names}
     return PatientMesh(
         mesh=mesh,
         lesions=tuple(name for name in names[1:] if is_lesion(name)),
-        volumes=region_volumes(mesh, names, given.volume, volumes),
+        volumes=region_volumes(mesh, names, tets.volume, volumes),
         cell_size=cell_size,
         coarsening=1,
         mesher="the file's tets",
         convention=FILE_CONVENTION,
-        sources=(given.source,),
+        sources=(tets.source,),
         notes=(),
         is_scan=False,
     )
 
 
-def surfaces_of_tets(given: PatientTets) -> PatientSurfaces:
+def surfaces_of_tets(tets: PatientTets) -> PatientSurfaces:
     """Surfaces of the organ and of its regions, to be filled with tets anew.
 
     Raises:
         MeshError: a region whose tets enclose no single body each, such as tets that share an edge alone.
     """
-    mesh, names = given.mesh, given.names
-    organ = ClosedSurface(names[0], *_closed(mesh.points, mesh.boundary_triangles, f"{given.source}: {names[0]}"))
+    mesh, names = tets.mesh, tets.names
+    organ = ClosedSurface(names[0], *_closed(mesh.points, mesh.boundary_triangles, f"{tets.source}: {names[0]}"))
     inner = []
     for tag, name in mesh.region_names[1:]:
         bodies = bodies_of(mesh.points, _boundary(mesh.tets[mesh.region == tag]).astype(np.int64))
         for number, body in enumerate(bodies, start=1):
             numbered = name if len(bodies) == 1 else f"{name} {number}"
-            inner.append(ClosedSurface(numbered, *_closed(*body, f"{given.source}: {numbered}")))
-    return PatientSurfaces(organ, tuple(inner), (given.source,), ())
+            inner.append(ClosedSurface(numbered, *_closed(*body, f"{tets.source}: {numbered}")))
+    return PatientSurfaces(organ, tuple(inner), (tets.source,), ())
 
 
 def _closed(points: FloatArray, triangles: IntArray | Triangles, name: str) -> tuple[FloatArray, Triangles]:

@@ -1,8 +1,8 @@
 """A learned acquisition function for SurgSim/PalpateSites-v0: the worth of a press at each site of the touch map.
 
-Bayesian optimisation presses where an acquisition function of mean and standard deviation is largest; here that
+Bayesian optimisation presses at the largest value of an acquisition function of mean and standard deviation; here that
 function, the same at every site of every organ, is learned (after Volpp et al. 2020, "Meta-learning acquisition
-functions for transfer learning in Bayesian optimization"): a formula of 13 numbers that an evolution strategy finds
+functions for transfer learning in Bayesian optimization"): a formula with 13 numbers from an evolution strategy
 (`agents/learn_sites.py`).
 """
 
@@ -19,7 +19,7 @@ from surgsim_env.palpation import EXCESS_SPREAD, MAP_SIDE
 
 # Logit of a site over its worth.
 SHARPNESS = 6.0
-# Least values of t to v, which are no weights.
+# Least values of t to v (no weights).
 LEAST = (-1.0, 0.2, 0.15, 0.15, -1.0, 0.02, -5.0, 0.02)
 
 
@@ -30,13 +30,13 @@ class Acquisition:
     With the expected excess m and its deviation s over the prior's, and the least excess of a lesion m_0,
 
         a(x) = m + w_s s + w_g (G_r * (p u))(x) + h (w_h + w_hs s + w_hm m)
-        u = max(0, (s - t) / (1 - t))^q                     uncertainty that presses have left at each site
-        p = sigmoid(((G_R * c)(x) - f) / d)                 whether the face around a site is wide enough for a lesion
-        h = sigmoid((m / m_0 - k) / v)                      whether a lesion was felt there
+        u = max(0, (s - t) / (1 - t))^q                     remaining uncertainty of each site
+        p = sigmoid(((G_R * c)(x) - f) / d)                 about 1 for a face wide enough around a site, else 0
+        h = sigmoid((m / m_0 - k) / v)                      about 1 for a felt lesion, else 0
 
-    * is convolution, G_r a Gaussian of standard deviation r (in radii of the lesions) and integral 1, c 1 at sites that
-    may be chosen and 0 elsewhere. The second term makes it an upper confidence bound, the third prefers sites from
-    which much unexplored tissue is felt, the last changes the worth around a lesion that was felt.
+    * is convolution, G_r a Gaussian of standard deviation r (in radii of the lesions) and integral 1, c 1 at candidate
+    sites and 0 elsewhere. The second term makes it an upper confidence bound, the third prefers sites amid much
+    unexplored tissue, the last changes the worth around a felt lesion.
 
     Args:
         values: (13,), w_s, w_g, w_h, w_hs, w_hm, t, q, r, R, f, d, k, v; by default an upper confidence bound with the
@@ -59,8 +59,8 @@ class Acquisition:
         bound, gain, hot, hot_spread, hot_excess = values[:5]
         limit, power, reach, room, share, softness, onset, width = torch.maximum(values[5:], torch.tensor(LEAST))
         excess, spread, candidates, cell, radius, least = (
-            torch.as_tensor(one, dtype=torch.float32)
-            for one in (
+            torch.as_tensor(value, dtype=torch.float32)
+            for value in (
                 *(belief.excess / EXCESS_SPREAD, belief.spread / EXCESS_SPREAD, process.candidates),
                 *(facts.map.cell, facts.lesion_radius, facts.excess_least / EXCESS_SPREAD),
             )
@@ -72,7 +72,7 @@ class Acquisition:
         return excess + bound * spread + gain * _blurred(fits * unknown, cell, reach * radius) + around
 
     def best(self, process: SiteProcess, belief: Belief, pressed: NDArray[np.bool_]) -> int:
-        """The candidate of most worth that was not pressed (n n,) yet; where all were, one of them again."""
+        """The candidate of most worth not pressed (n n,) yet; if all were, one of them again."""
         fresh = process.candidates & ~pressed
         allowed = fresh if fresh.any() else process.candidates
         worth = self.worth(process, belief).masked_fill(~torch.as_tensor(allowed), -torch.inf)

@@ -12,11 +12,11 @@ class Stage:
     """Rewards of a part of the curriculum, beside the environment's own.
 
     Args:
-        begin: decisions at which it begins.
-        failure: paid share of the reward terms of a failure (`per` "failure" or "step left"); below 1 a policy that
-            still fails by chance does not learn to do nothing instead.
-        novelty: reward of each site of the touch map that is felt for the first time in an episode (count-based
-            exploration, Bellemare et al. 2016); for SurgSim/Palpate-v0 with memory.
+        begin: number of decisions at its begin.
+        failure: paid share of the reward terms of a failure (`per` "failure" or "step left"); below 1 a policy with
+            failures by chance does not learn to do nothing instead.
+        novelty: reward of each site of the touch map at its first touch in an episode (count-based exploration,
+            Bellemare et al. 2016); for SurgSim/Palpate-v0 with memory.
         near: distance from the lesion [m] up to which a wrong declaration of SurgSim/Palpate-v0 is paid as a right one.
     """
 
@@ -27,13 +27,15 @@ class Stage:
 
 
 class StagedRewards(VecEnvWrapper):
-    """Environments whose rewards are those of `stage`, which may be replaced between steps."""
+    """Environments with the rewards of `stage`, replaceable between steps."""
 
     def __init__(self, envs: VecEnv, stage: Stage) -> None:
         super().__init__(envs)
         first = envs.get_attr("unwrapped", indices=[0])[0]
-        self.failure_terms = [f"reward_{one.name}" for one in first.task.rewards if one.per in ("failure", "step left")]
-        self.success_reward = sum(one.weight for one in first.task.rewards if one.per == "success")
+        self.failure_terms = [
+            f"reward_{term.name}" for term in first.task.rewards if term.per in ("failure", "step left")
+        ]
+        self.success_reward = sum(term.weight for term in first.task.rewards if term.per == "success")
         self.visited: slice = first.observation_slices.get("visited", slice(0))
         self.stage = stage
         self._felt = np.zeros(envs.num_envs)
@@ -60,15 +62,15 @@ class StagedRewards(VecEnvWrapper):
         return observation, paid, done, infos
 
     def _count(self, observation: VecEnvObs) -> np.ndarray:
-        """The number of sites felt in each environment (n_env,)."""
+        """Number of felt sites in each environment (n_env,)."""
         return np.asarray(observation)[:, self.visited].sum(axis=1)
 
 
 class RepeatedAction(VecEnvWrapper):
     """One decision lasts `count` control steps; their rewards are summed.
 
-    If an episode ends within a decision, its environment, which has begun the next episode, gets zero actions for the
-    rest of the decision; the rewards of those steps count for the next episode.
+    After the end of an episode within a decision its environment, in the next episode already, gets zero actions until
+    the decision ends; the rewards of those steps count for the next episode.
     """
 
     def __init__(self, envs: VecEnv, count: int) -> None:

@@ -1,4 +1,4 @@
-"""What matters of an observation of SurgSim/Palpate-v0 with memory=True and frame="face", the same for every organ."""
+"""Features of an observation of SurgSim/Palpate-v0 with memory=True and frame="face", the same for every organ."""
 
 from dataclasses import dataclass
 
@@ -19,16 +19,16 @@ OBSERVATION_SIZE = max(part.stop for part in FACE.values())
 ROW_SPACING, BORDER = 2.4, 0.8
 # Reach of the second search, across the rows, around the stiffest place [tip radii].
 ACROSS_REACH = 2.0
-# A peak along its row is passed where something was felt this far to both sides of it [tip radii].
+# Distances of felt sites to both sides of a passed peak, along its row [tip radii].
 PASSED = (0.8, 2.4)
-# Largest distance that a way is told as [tip radii]; farther ones have their direction.
+# Longer displacements are shortened to this, in the same direction [tip radii].
 WAY_MOST = 3.0
 FAR = 1e6
-# Least height of a normal that slopes are computed with.
+# Least height of a normal for slopes.
 UPRIGHT = 0.3
-# An excess that may be a lesion, and the range around it that is magnified.
+# Excess of a possible lesion, and the magnified range around it.
 EXCESS_MIDDLE, EXCESS_NEAR = 0.3, 0.1
-# Share of the time left below which it is told.
+# Share of the time left below which it is an input.
 LATE = 0.2
 # Entries of `face_summary`, the distance near a way's end, and the depth in the middle of its range [tip radii].
 SUMMARY_SIZE, WAY_NEAR, DEPTH_MIDDLE = 28, 0.4, 0.4
@@ -36,18 +36,18 @@ SUMMARY_SIZE, WAY_NEAR, DEPTH_MIDDLE = 28, 0.4, 0.4
 
 @dataclass(frozen=True, eq=False)
 class FaceFeatures:
-    """Of n observations; lengths in tip radii, forces over the soft limit, on the axes of the face.
+    """Features of n observations; lengths in tip radii, forces over the soft limit, on the axes of the face.
 
     Fields:
         depth: of the ball below the surface at rest                                                        (n,)
         force: along the normal there                                                                       (n,)
         normal: of the surface                                                                              (n, 3)
-        begun: 1 where something was felt                                                                   (n,)
-        row_way, rows_left: to the next site of the rows; share of their sites that is left       (n, 2), (n,)
-        across_way, across_left: to the next site across them, through the stiffest; 1 where there is one  (n, 2), (n,)
+        begun: 1 after the first touch, else 0                                                              (n,)
+        row_way, rows_left: to the next site of the rows; share of their remaining sites          (n, 2), (n,)
+        across_way, across_left: to the next site across them, through the stiffest; 1 if there is one     (n, 2), (n,)
         stiffest_way: to the stiffest place                                                                 (n, 2)
-        excess: contrast of the stiffest place over the median of the sites felt, less 1                    (n,)
-        passed: 1 where something was felt on both sides of the stiffest place along its row                (n,)
+        excess: contrast of the stiffest place over the median of felt sites, less 1                        (n,)
+        passed: 1 after touches on both sides of the stiffest place along its row, else 0                   (n,)
         time_left: share                                                                                    (n,)
     """
 
@@ -66,11 +66,11 @@ class FaceFeatures:
 
 
 def face_features(observations: torch.Tensor) -> FaceFeatures:
-    """The features of observations (n, n_observation).
+    """Features of observations (n, n_observation).
 
     The rows lie along the first axis of the face, equally far apart, at most ROW_SPACING. The next site is the nearest
-    one that is left of the first row that is not finished, of a row where nothing was felt yet the nearer end; rows
-    follow each other from the first or from the last, whichever the tip was nearer to.
+    remaining one of the first unfinished row, or the nearer end of a fresh row; rows follow each other from the first
+    or the last one, the nearer to the tip at the begin.
     """
     part = {name: observations[:, place] for name, place in FACE.items()}
     count, place = len(observations), part["tip_place"]
@@ -78,7 +78,7 @@ def face_features(observations: torch.Tensor) -> FaceFeatures:
     steps = torch.arange(MAP_SIDE, dtype=observations.dtype) - MAP_SIDE // 2
     visited = part["visited"].reshape(-1, MAP_SIDE, MAP_SIDE) > 0.5
     face = part["face"].reshape(-1, MAP_SIDE, MAP_SIDE) > 0.5
-    # A site counts as felt where a neighbour was.
+    # A site with a visited neighbour counts as felt.
     felt = max_pool2d(visited.to(observations.dtype)[:, None], 3, 1, 1)[:, 0] > 0.5
     gap_u = steps * cell - place[:, :1]
     gap_v = steps * cell - place[:, 1:2]
@@ -92,7 +92,7 @@ def face_features(observations: torch.Tensor) -> FaceFeatures:
     numbers = torch.arange(MAP_SIDE).expand(count, -1)
     first = torch.where(is_row, numbers, MAP_SIDE).amin(dim=1)
     last = torch.where(is_row, numbers, -1).amax(dim=1)
-    first_felt, last_felt = (row_felt.gather(1, one[:, None])[:, 0] for one in (first, last.clamp(min=0)))
+    first_felt, last_felt = (row_felt.gather(1, outer[:, None])[:, 0] for outer in (first, last.clamp(min=0)))
     upward = gap_v.gather(1, first[:, None].clamp(max=MAP_SIDE - 1)).abs() <= gap_v.gather(1, last[:, None]).abs()
     upward = first_felt | (~last_felt & upward[:, 0])
     order = torch.where(upward[:, None], numbers, MAP_SIDE - numbers)
@@ -170,25 +170,25 @@ class FaceSummary(nn.Module):
 def face_summary(seen: FaceFeatures) -> torch.Tensor:
     """Features as the entries of a network's input, shape (n, SUMMARY_SIZE).
 
-    Ways are given twice, as they are and magnified near their ends, where a tip slows down, the latter also with the
-    heights that they climb along the surface; the excess, too, and depth and force around those of a sliding tip.
+    Ways and the excess are given twice, as they are and magnified: ways near their ends, for a tip that slows down, and
+    with their climbs along the surface. Depth and force are centred at those of a sliding tip.
     """
     ways = torch.stack([seen.row_way, seen.across_way, seen.stiffest_way], dim=1)
     near = (ways / WAY_NEAR).clamp(-1.0, 1.0)
     normal = seen.normal
     climbs = -(near * normal[:, None, :2]).sum(dim=2) / normal[:, 2:].clamp(min=UPRIGHT)
     late = (LATE - seen.time_left).clamp(min=0.0) / LATE
-    rest = [
+    parts = [
         *((seen.depth - DEPTH_MIDDLE) * 4.0, seen.force * 2.0, seen.begun, seen.rows_left, seen.across_left),
         *((seen.rows_left == 0.0).to(ways.dtype), seen.excess * 2.0, seen.passed, late),
         ((seen.excess - EXCESS_MIDDLE) / EXCESS_NEAR).clamp(-1.0, 1.0),
     ]
-    others = torch.stack(rest, dim=1).clamp(-3.0, 3.0)
+    others = torch.stack(parts, dim=1).clamp(-3.0, 3.0)
     return torch.cat([ways.flatten(1) / WAY_MOST, near.flatten(1), climbs, others, normal], dim=1)
 
 
 def _rows(face: torch.Tensor, cell: torch.Tensor) -> torch.Tensor:
-    """Which rows of the map (n, MAP_SIDE) the search goes along, for faces (n, MAP_SIDE, MAP_SIDE) and cells (n, 1)."""
+    """Mask of the search's rows of the map (n, MAP_SIDE), for faces (n, MAP_SIDE, MAP_SIDE) and cells (n, 1)."""
     numbers = torch.arange(MAP_SIDE)
     there = face.any(dim=2)
     low = torch.where(there, numbers, MAP_SIDE).amin(dim=1, keepdim=True).to(cell.dtype)
@@ -196,13 +196,13 @@ def _rows(face: torch.Tensor, cell: torch.Tensor) -> torch.Tensor:
     edge = torch.minimum((BORDER / cell).round(), torch.div(high - low, 2, rounding_mode="floor"))
     low, high = low + edge, high - edge
     count = torch.ceil((high - low) * cell / ROW_SPACING - 1e-4).clamp(min=1.0)
-    # Row k of count + 1 lies at low + k (high - low) / count, rounded; a number is a row where one rounds to it.
+    # Row k of count + 1 lies at low + k (high - low) / count, rounded.
     k = torch.round((numbers - low) * count / (high - low).clamp(min=1.0)).clamp(min=0.0)
     k = torch.minimum(k, count)
     return (torch.round(low + k * (high - low) / count) == numbers) & (numbers >= low) & (numbers <= high)
 
 
 def _way(gap: torch.Tensor) -> torch.Tensor:
-    """Ways (n, 2) shortened to WAY_MOST in the larger of their parts."""
+    """Ways (n, 2) shortened to WAY_MOST in their larger part."""
     size = gap.abs().amax(dim=1, keepdim=True).clamp(min=1e-6)
     return gap * torch.clamp(WAY_MOST / size, max=1.0)

@@ -1,12 +1,12 @@
 """A fast surrogate of SurgSim/Palpate-v0 on organs of any shape: forces from a formula, all else from the task itself.
 
-Training starts here; agents are scored on the full physics only. The ball goes where it is told, and the surface stays
-where it is at rest. With Hertz's force h of healthy tissue at the ball's depth below it, the force along the normal is
+Training starts here; agents are scored on the full physics only. The ball follows its command, and the surface stays at
+rest. With Hertz's force h of healthy tissue at the ball's depth below it, the force along the normal is
 
     F = s b h(depth) (1 + A exp(-r^2 / (2 w^2))) (1 + g(x))
 
 with s the organ's stiffness over Hertz's half space, b the drawn background, r the distance from the lesion's place, A
-and w its excess and width, and g a smooth field of a few waves: rims and ligaments that are felt without a lesion.
+and w its excess and width, and g a smooth field of a few waves, in place of rims and ligaments.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from surgsim_env.palpation import Indenter
 from surgsim_env.tasks import ControlStep
 
-# Ranges that an episode draws: s, A, w over the lesion's radius, amplitude of g, and wavelength over the tip's radius.
+# Ranges of an episode: s, A, w over the lesion's radius, amplitude of g, and wavelength over the tip's radius.
 STIFFNESS, EXCESS, WIDTH, WAVE_MOST, WAVE_LENGTH = (1.2, 1.8), (0.35, 1.1), (0.6, 0.9), 0.12, (5.0, 15.0)
 WAVES = 3
 FRICTION = 0.2
@@ -28,7 +28,7 @@ FRICTION = 0.2
 
 @dataclass
 class FormulaTip:
-    """What a task reads of an instrument and of a simulation, without either."""
+    """Stand-in for the instrument and the simulation of a task."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
@@ -49,7 +49,7 @@ class FormulaTip:
         self.tip_velocity = np.asarray(velocity, dtype=np.float64)
 
     def ground_shift(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """No ground moves."""
+        """Zero: the ground is at rest."""
         return np.zeros(3)
 
 
@@ -57,8 +57,8 @@ class FaceSurrogate:
     """Palpations of organs side by side, one episode each.
 
     Fields:
-        envs: environments whose tasks are played; nothing of them is simulated
-        over: which episodes have ended                                       (n_env,)
+        envs: environments for their tasks alone, without simulation
+        over: mask of ended episodes                                          (n_env,)
         infos: the last info of each
     """
 
@@ -89,7 +89,7 @@ class FaceSurrogate:
         return self._observations.copy()
 
     def step(self, actions: NDArray[np.floating]) -> NDArray[np.float32]:
-        """One control step of the episodes that go on; returns observations (n_env, n_observation)."""
+        """One control step of the running episodes; returns observations (n_env, n_observation)."""
         for index in np.flatnonzero(~self.over):
             env, tip, action = self.envs[index], self.tips[index], np.asarray(actions[index], dtype=np.float64)
             env.runtime.begin(action, tip)
@@ -104,7 +104,7 @@ class FaceSurrogate:
         return self._observations.copy()
 
     def _begun(self, env: Any) -> FormulaTip:
-        """A tip where an episode begins, which is drawn without making its organ."""
+        """A tip at the start of a drawn episode, without its organ."""
         instrument = env.simulation.instrument
         start = np.asarray(env.runtime.draw(self.rng), dtype=np.float64)
         return FormulaTip(instrument.lower, instrument.upper, start, np.zeros(3), np.zeros(3))

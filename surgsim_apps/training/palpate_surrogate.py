@@ -1,4 +1,4 @@
-"""A fast surrogate of SurgSim/Palpate-v0 on the block of `phantom_small`: forces from a formula instead of an organ.
+"""A fast surrogate of SurgSim/Palpate-v0 on the block of `phantom_small`, with forces from a formula.
 
 Agents are scored on the full physics only. The force of a press at x, y and depth d is
 
@@ -40,7 +40,7 @@ FRICTION = 0.2
 
 
 class PalpateSurrogate(VectorEnv):
-    """Many palpations of a block's flat top, by formula; an environment that ends is reset in the same step."""
+    """Vectorised palpations of a block's flat top, by formula; an ended episode is reset in the same step."""
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
@@ -155,7 +155,7 @@ class PalpateSurrogate(VectorEnv):
         self.square[rows, sites] += healthy**2
 
     def _recalled(self) -> tuple[NDArray[np.float64], ...]:
-        """Contrasts, visited marks and the stiffest place, as `TouchMemory` gives them."""
+        """Contrasts, visited marks and the stiffest place of a `TouchMemory`."""
         visited = self.square > 0.0
         contrast = np.divide(self.product, self.square, out=np.zeros_like(self.product), where=visited)
         return contrast, visited.astype(np.float64), stiffest_spots(self.bell_fit, self.product, self.square)
@@ -163,33 +163,33 @@ class PalpateSurrogate(VectorEnv):
     def _judge(
         self, force: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Callable[[int], dict[str, Any]]]:
-        """Rewards, ends and infos, as `TaskRuntime.judge` has them."""
+        """Rewards, ends and infos of `TaskRuntime.judge`."""
         limits, weights = self.scene.limits, reward_weights(PalpateTask)
         hard = force > limits.hard_force
         declared = ~hard & (self.declared >= DECLARE_STEPS)
         error = np.linalg.norm(self.tip[:, :2] - self.lesion, axis=1)
-        found = declared & (error <= self.task.success_distance)
+        right = declared & (error <= self.task.success_distance)
         terminated, left = hard | declared, EPISODE_STEPS - self.steps
         share = np.clip((force - limits.soft_force) / (limits.hard_force - limits.soft_force), 0.0, 1.0)
         rewards = (
             weights["time"]
             + weights["soft_force"] * share
-            + weights["found"] * found
-            + weights["wrong"] * (declared & ~found)
+            + weights["found"] * right
+            + weights["wrong"] * (declared & ~right)
             + weights["hard_force"] * hard
-            + weights["forgone"] * (terminated & ~found) * left
+            + weights["forgone"] * (terminated & ~right) * left
         )
 
         def ending(index: int) -> dict[str, Any]:
             return {
-                "success": bool(found[index]),
+                "success": bool(right[index]),
                 "declared": bool(declared[index]),
                 "hard_limit": bool(hard[index]),
                 "error_mm": float(error[index]) * 1000.0 if declared[index] else -1.0,
-                "reward_wrong": weights["wrong"] * float(declared[index] and not found[index]),
+                "reward_wrong": weights["wrong"] * float(declared[index] and not right[index]),
                 "reward_hard_force": weights["hard_force"] * float(hard[index]),
                 "reward_fault": 0.0,
-                "reward_forgone": weights["forgone"] * float(terminated[index] and not found[index]) * int(left[index]),
+                "reward_forgone": weights["forgone"] * float(terminated[index] and not right[index]) * int(left[index]),
             }
 
         return rewards, terminated, ~terminated & (left <= 0), ending

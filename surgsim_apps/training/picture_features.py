@@ -1,17 +1,17 @@
-"""Features of a small picture and the force readings beside it, for policies that see nothing else."""
+"""Features of a small picture and its force readings, for policies without other inputs."""
 
 import torch
 from torch import nn
 
 # Side of the pictures of obs_mode "rgb_force" [pixels], and its force readings.
 PICTURE_SIDE, FORCE_COUNT = 84, 8
-# Channels of the three convolutions, and side of the coarse map that is read beside the places of features.
+# Channels of the three convolutions, and side of the coarse map beside the places of features.
 WIDTHS = (12, 24, 24)
 COARSE_SIDE = 6
 
 
 class PictureAndForce(nn.Module):
-    """Of obs_mode "rgb_force": where each feature of the picture lies, a coarse map of the features, and the force.
+    """Inputs of obs_mode "rgb_force": places of the picture's features, their coarse map, and the force.
 
     The place of a feature is the mean of the pixels' places, weighted by the softmax of its map (Levine et al. 2016,
     "End-to-end training of deep visuomotor policies").
@@ -34,7 +34,7 @@ class PictureAndForce(nn.Module):
             _, _, rows, columns = self.convolutions(torch.zeros(1, 3, PICTURE_SIDE, PICTURE_SIDE)).shape
         places = torch.meshgrid(torch.linspace(-1.0, 1.0, rows), torch.linspace(-1.0, 1.0, columns), indexing="ij")
         self.places: torch.Tensor
-        self.register_buffer("places", torch.stack([one.ravel() for one in places], dim=1), persistent=False)
+        self.register_buffer("places", torch.stack([axis.ravel() for axis in places], dim=1), persistent=False)
         self.coarse = nn.AdaptiveAvgPool2d(COARSE_SIDE)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -1,7 +1,7 @@
-"""Policies as files: NAME.json describes a policy, and NAME.safetensors beside it holds the weights of its network.
+"""Policies as files: a description NAME.json, and beside it the network's weights NAME.safetensors.
 
-A policy for SurgSim/PalpateSites-v0 may be an acquisition function instead, whose 13 numbers stand in NAME.json.
-Reading the files runs no code of theirs.
+A policy for SurgSim/PalpateSites-v0 may be an acquisition function instead, with its 13 numbers in NAME.json. Reading
+the files runs no code of theirs.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from surgsim_env.envs import TASKS
 from surgsim_env.scene import fill
 from surgsim_env.tasks import Task
 
-# Seed of sampled actions, with the environment's index, where no episode gives them random numbers.
+# Seed of sampled actions, with the environment's index, without random numbers of an episode.
 SAMPLING_SEED = 0
 
 
@@ -33,7 +33,7 @@ class PolicyDescription:
 
     Fields:
         env_id, env_kwargs: environment of the policy
-        observation: declaration of what it reads (`observation_declaration`); None for environments without one
+        observation: its channels (`observation_declaration`); None for environments without a declaration
         action_repeat: control steps of a decision
         network: of NAME.safetensors; None for an acquisition function
         acquisition: its numbers; None for a network
@@ -51,18 +51,18 @@ class PolicyDescription:
 
     @property
     def plays_every_scene(self) -> bool:
-        """Whether its observation does not depend on a scene's size: touch maps and the frame of the face do not."""
+        """True if its observation is independent of a scene's size: touch maps, or the frame of the face."""
         return self.acquisition is not None or self.env_kwargs.get("frame") == "face"
 
     @property
     def home_scene(self) -> str:
-        """Name of the scene that it was trained on."""
+        """Name of its training scene."""
         task = TASKS.get(self.env_id.rpartition(":")[2])
         return Path(self.env_kwargs.get("scene") or (task.setup.scene if task else "")).stem
 
 
 def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
-    """Size and scale of each channel that an environment observes, by name; None for one without a task of ours.
+    """Size and scale of an environment's observed channels, by name; None for one without a task of ours.
 
     Beside a picture these are the channels of force alone.
     """
@@ -71,14 +71,16 @@ def observation_declaration(env: Any) -> dict[str, list[Any]] | None:
     if not isinstance(task, Task):
         return None
     space = inner.observation_space
-    read, pictures = set(inner.layout.declared), {}
+    observed = inner.layout.observed
+    read, pictures = {channel.name for channel, _ in observed}, {}
     if space.shape is None or len(space.shape) > 1:
         parts = space.spaces if isinstance(space, gym.spaces.Dict) else {"picture": space}
-        read = {one.name for one in task.channels if one.felt and "force" in parts}
+        read = {channel.name for channel in task.channels if channel.felt and "force" in parts}
         pictures = {"picture": [list(parts["picture"].shape or ()), "uint8"]}
-    channels = {name: one for name, one in inner.layout.declared.items() if name in read}
     return pictures | {
-        name: [size, scale if getattr(inner, "scaled", True) else "SI"] for name, (size, scale) in channels.items()
+        channel.name: [size, channel.scale_shown if getattr(inner, "scaled", True) else "SI"]
+        for channel, size in observed
+        if channel.name in read
     }
 
 
@@ -89,8 +91,8 @@ class TrainedPolicy:
     policy.reset(env_count)
     actions = policy.act(observations, begins)
 
-    It is an `EpisodeActor` of `surgsim_apps.scoring.episodes`: where `begin` is called, sampled actions follow from the
-    episode's own random numbers, whatever is played beside it.
+    It is an `EpisodeActor` of `surgsim_apps.scoring.episodes`: after `begin`, sampled actions follow from the episode's
+    own random numbers alone.
     """
 
     def __init__(self, decider: PolicyNetwork | Acquisition, description: PolicyDescription) -> None:
@@ -99,21 +101,21 @@ class TrainedPolicy:
         self.reset(1)
 
     def check_environment(self, env: gym.Env, name: str = "the policy") -> None:
-        """Check that this is an environment for the policy, which messages call `name`.
+        """Check an environment for the policy; messages call it `name`.
 
         Raises:
-            ValueError: it observes other channels, or in other scales, or is another scene than that of its training,
-                which only an acquisition function or a policy in the frame of the face can play.
+            ValueError: an environment with other channels or scales, or another scene than that of the training, unless
+                the policy plays every scene.
         """
-        reads, given, own = self.description.observation or {}, observation_declaration(env), self.description
-        if given is None:
-            # Of an environment that is not ours nothing is known.
+        reads, offered, own = self.description.observation or {}, observation_declaration(env), self.description
+        if offered is None:
+            # Nothing is known of a foreign environment.
             return
-        if wrong := [one for one in {**reads, **given} if reads.get(one) != given.get(one)]:
+        if wrong := [channel for channel in {**reads, **offered} if reads.get(channel) != offered.get(channel)]:
+            wanted, observed = ({channel: part.get(channel) for channel in wrong} for part in (reads, offered))
             raise ValueError(
-                f"{name} reads { ({one: reads.get(one) for one in wrong}) } where the observation of {own.env_id} with "
-                f"{own.env_kwargs} has { ({one: given.get(one) for one in wrong}) }: make the environment as the "
-                "policy's file says"
+                f"{name} reads {wanted} where the observation of {own.env_id} with {own.env_kwargs} has {observed}: "
+                "make the environment as the policy's file says"
             )
         scene = env.unwrapped.scene.name  # type: ignore[attr-defined]
         if not own.plays_every_scene and scene != own.home_scene:
@@ -129,7 +131,7 @@ class TrainedPolicy:
         self._actions: NDArray[np.float32] | None = None
 
     def begin(self, index: int, env: Any, rng: np.random.Generator) -> None:
-        """Begin an episode in environment `index`, whose sampled actions are drawn by `rng`."""
+        """Begin an episode in environment `index`, with sampled actions from `rng`."""
         self._random[index] = _generator(rng)
 
     def end(self, index: int) -> None:
@@ -142,7 +144,7 @@ class TrainedPolicy:
     def act(self, observations: Any, begins: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Actions (n, n_action) for raw observations (n, n_observation), or a dictionary of arrays (n, ...).
 
-        An episode begins where `begins` (n,) is true; without it at the first call after `reset` alone.
+        An episode begins in environments of the mask `begins` (n,); without it at the first call after `reset` alone.
         """
         self._since[self._since == 0 if begins is None else begins] = 0
         deciding = self._since % self.description.action_repeat == 0
@@ -162,7 +164,7 @@ def _generator(rng: np.random.Generator) -> torch.Generator:
 
 
 def policy_path(text: str) -> Path:
-    """The path of a policy that is to be written, as `type` of an option of a command line."""
+    """The path of a new policy, as `type` of an option of a command line."""
     if Path(text).suffix != ".json":
         raise argparse.ArgumentTypeError(f"policy {text}: the rule is NAME.json; NAME.safetensors is written beside it")
     return Path(text)
@@ -175,7 +177,7 @@ def save_policy(decider: PolicyNetwork | Acquisition, description: PolicyDescrip
         written = replace(description, acquisition=decider.values, network=None)
     else:
         written = replace(description, acquisition=None, network=decider.layout)
-        weights = {name: one.contiguous() for name, one in decider.state_dict().items()}
+        weights = {name: weight.contiguous() for name, weight in decider.state_dict().items()}
         path.with_suffix(".safetensors").write_bytes(safetensors.torch.save(weights))
     path.with_suffix(".json").write_text(json.dumps(asdict(written), indent=1) + "\n", encoding="utf-8")
     return TrainedPolicy(decider, written)
@@ -185,7 +187,7 @@ def load_policy(path: Path) -> TrainedPolicy:
     """The policy of NAME.json or NAME.safetensors, the path of either.
 
     Raises:
-        ValueError: a file is missing, damaged, or does not fit the other (names the file and the reason).
+        ValueError: a missing, damaged or mismatched file (names the file and the reason).
     """
     description = read_description(path)
     if description.network is None:
@@ -201,7 +203,7 @@ def read_description(path: Path) -> PolicyDescription:
     """The description in NAME.json, the path of a policy's either file.
 
     Raises:
-        ValueError: no such file, a file that is no JSON, or an entry that is unknown, missing or wrong.
+        ValueError: no such file, no JSON, or an unknown, missing or wrong entry.
     """
     document = path.with_suffix(".json")
     try:
@@ -212,10 +214,10 @@ def read_description(path: Path) -> PolicyDescription:
 
 
 def _filled(layout: NetworkLayout, weights: dict[str, torch.Tensor]) -> PolicyNetwork:
-    """A network with these weights, whose shapes are the sizes of its layers."""
+    """A network with these weights, and their sizes of layers."""
     numbers = sorted(int(name.split(".")[1]) for name in weights if name.startswith("layers.") and "weight" in name)
     layers = [weights[f"layers.{number}.weight"] for number in numbers]
-    sizes = [layers[0].shape[1], *(one.shape[0] for one in layers)]
+    sizes = [layers[0].shape[1], *(layer.shape[0] for layer in layers)]
     network = PolicyNetwork(layout, sizes, normalised="mean" in weights, drawn="log_spread" in weights)
     network.load_state_dict(weights)
     return network

@@ -31,7 +31,7 @@ class NetworkLayout:
 
     Args:
         activation: between the layers, a name of ACTIVATIONS.
-        features: that the layers read, a name of FEATURES; the observation itself if None.
+        features: input of the layers, a name of FEATURES; the observation itself if None.
     """
 
     activation: str = "tanh"
@@ -39,18 +39,18 @@ class NetworkLayout:
 
 
 class PolicyNetwork(nn.Module):
-    """A policy's network; called with observations it gives the mean actions."""
+    """A policy's network, from observations to mean actions."""
 
     def __init__(
         self, layout: NetworkLayout, sizes: Sequence[int], *, normalised: bool = False, drawn: bool = False
     ) -> None:
-        """Make the network with weights as torch initialises them.
+        """Make the network with torch's initial weights.
 
         Args:
             layout: names of its parts.
-            sizes: of what the layers read, of each hidden layer and of the action.
-            normalised: observations are normalised first (`normalise_by`).
-            drawn: actions are drawn around their mean, with standard deviations exp(`log_spread`).
+            sizes: of the layers' input, of each hidden layer and of the action.
+            normalised: True to normalise observations first (`normalise_by`).
+            drawn: True to draw actions around their mean, with standard deviations exp(`log_spread`).
         """
         super().__init__()
         self.layout = layout
@@ -91,38 +91,38 @@ class PolicyNetwork(nn.Module):
         return scaled.clamp(-CUT, CUT).float()
 
     def forward(self, observations: Any) -> torch.Tensor:
-        """Mean actions (n, n_action) for observations as `read` takes them."""
+        """Mean actions (n, n_action) for observations of `read`."""
         return self.layers(self.features(self.read(observations)))
 
     @torch.no_grad()
     def actions(self, observations: Any, generators: Sequence[torch.Generator]) -> NDArray[np.float32]:
-        """Actions (n, n_action) in [-1, 1]; where they are drawn, each row by its own generator."""
+        """Actions (n, n_action) in [-1, 1]; drawn ones by a generator for each row."""
         if self.log_spread is None:
             return self(observations).clamp(-1.0, 1.0).numpy()
         rows = []
         for index, generator in enumerate(generators):
             # Row by row: the bits of a product of matrices depend on the number of rows.
-            one = slice(index, index + 1)
-            alone = {name: part[one] for name, part in observations.items()} if isinstance(observations, dict) else None
-            mean = self(observations[one] if alone is None else alone)
+            row = slice(index, index + 1)
+            alone = {name: part[row] for name, part in observations.items()} if isinstance(observations, dict) else None
+            mean = self(observations[row] if alone is None else alone)
             noise = torch.randn(mean.shape, generator=generator)
             rows.append((mean + noise * self.log_spread.exp()).clamp(-1.0, 1.0))
         return torch.cat(rows).numpy()
 
 
 def actor_of(policy: Any, layout: NetworkLayout, *, drawn: bool = False) -> PolicyNetwork:
-    """The actor of a policy of stable-baselines3's PPO or A2C as a network of its own.
+    """The actor of a policy of stable-baselines3's PPO or A2C as a `PolicyNetwork`.
 
     Args:
         policy: an ActorCriticPolicy with hidden layers of one activation and without state-dependent exploration.
         layout: names of its parts.
         drawn: keep the standard deviation of its actions.
     """
-    linear = [one for one in [*policy.mlp_extractor.policy_net, policy.action_net] if isinstance(one, nn.Linear)]
-    made = PolicyNetwork(layout, [linear[0].in_features, *(one.out_features for one in linear)], drawn=drawn)
-    for own, given in zip((one for one in made.layers if isinstance(one, nn.Linear)), linear, strict=True):
-        own.load_state_dict(given.state_dict())
-    made.features.load_state_dict(policy.features_extractor.state_dict())
+    linear = [layer for layer in [*policy.mlp_extractor.policy_net, policy.action_net] if isinstance(layer, nn.Linear)]
+    network = PolicyNetwork(layout, [linear[0].in_features, *(layer.out_features for layer in linear)], drawn=drawn)
+    for own, trained in zip((layer for layer in network.layers if isinstance(layer, nn.Linear)), linear, strict=True):
+        own.load_state_dict(trained.state_dict())
+    network.features.load_state_dict(policy.features_extractor.state_dict())
     if drawn:
-        made.log_spread = policy.log_std.detach().clone()
-    return made
+        network.log_spread = policy.log_std.detach().clone()
+    return network

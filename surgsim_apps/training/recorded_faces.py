@@ -1,8 +1,8 @@
-"""Recorded faces for the surrogate of SurgSim/PalpateSites-v0: the contrasts that presses of real episodes feel.
+"""Recorded faces for the surrogate of SurgSim/PalpateSites-v0: contrasts of presses in real episodes.
 
-Organs, of a family each of another shape, are drawn as the environment draws them and pressed once at every other row
-and column of their touch maps (`agents/record_faces.py`); between these sites contrasts are interpolated. Scores are
-computed on the environment itself, never on a recording.
+Organs, of a family each of another shape, are drawn by the environment and pressed once at every other row and column
+of their touch maps (`agents/record_faces.py`); between these sites contrasts are interpolated. Scores are computed on
+the environment itself, never on a recording.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ from surgsim_env.tasks import PalpateSitesTask
 
 # Episode k of a recording is reset with this seed plus k; the benchmark's evaluation seeds are others.
 FIRST_SEED = 6_000_000
-# Organs that are pressed side by side.
+# Organs side by side.
 LANES = 16
-# Of the touch map's rows and columns, every so many are pressed.
+# Step between pressed rows and columns of the touch map.
 SITE_STEP = 2
 # Sites of the recorded surface on each side of the chart.
 SURFACE_SIDE = 49
-# Pressed sites that an interpolated contrast depends on, and the smoothing of the cubic spline.
+# Pressed sites for an interpolated contrast, and the smoothing of the cubic spline.
 NEIGHBOURS, SMOOTHING = 30, 1e-4
 
 
@@ -41,10 +41,10 @@ class RecordedFaces:
     Fields:
         extent: of the charts [m]                                                               (n_face, 2)
         cell: of the touch maps [m]                                                             (n_face,)
-        pressable: sites of the touch maps that may be pressed                                  (n_face, n n)
+        pressable: mask of the touch maps' pressable sites                                      (n_face, n n)
         log_contrast: at these sites, without the sensor's noise; 0 elsewhere                   (n_face, n n)
         surface: points of the face over a square grid of the chart [m]                         (n_face, m, m, 3)
-        truth: points of the face nearest to the lesions [m], NaN where there are fewer         (n_face, k, 3)
+        truth: points of the face nearest to the lesions [m], filled up with NaN                (n_face, k, 3)
         tip_radius, lesion_radius: [m]                                                          (n_face,)
         noise, map_spread: of the estimator                                                     (n_face,)
     """
@@ -61,7 +61,7 @@ class RecordedFaces:
     map_spread: FloatArray
 
     def __len__(self) -> int:
-        """How many faces there are."""
+        """Number of faces."""
         return len(self.extent)
 
     def __call__(self, rng: np.random.Generator) -> SurrogateFace:
@@ -93,7 +93,9 @@ class RecordedFaces:
         """Write the recording, numbers in single precision."""
         path.parent.mkdir(parents=True, exist_ok=True)
         values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        single = {name: one.astype(np.float32) if one.dtype == np.float64 else one for name, one in values.items()}
+        single = {
+            name: value.astype(np.float32) if value.dtype == np.float64 else value for name, value in values.items()
+        }
         np.savez_compressed(path, **single)
 
 
@@ -105,9 +107,9 @@ def _on_surface(surface: FloatArray, extent: FloatArray, points: FloatArray) -> 
 def load_faces(path: str | Path) -> RecordedFaces:
     """Read a recording of `agents.record_faces`."""
     with np.load(path, allow_pickle=False) as file:
-        kept = {field.name: file[field.name] for field in fields(RecordedFaces)}
+        arrays = {field.name: file[field.name] for field in fields(RecordedFaces)}
     return RecordedFaces(
-        **{name: value.astype(np.float64) if value.dtype == np.float32 else value for name, value in kept.items()}
+        **{name: value.astype(np.float64) if value.dtype == np.float32 else value for name, value in arrays.items()}
     )
 
 
@@ -122,13 +124,13 @@ def record_faces(
     Args:
         scene: by name or path.
         split: of a family; the environment's own if None.
-        level: what an episode draws.
+        level: of difficulty.
         count: of faces.
         progress: called with the number of faces after each batch.
 
     Raises:
         ValueError: a split for a scene without a family.
-        RuntimeError: a press ended its episode, by a fault or the hard limit (names the seed and the site).
+        RuntimeError: a press with a fault or beyond the hard limit (names the seed and the site).
     """
     # The budget ends no episode before all sites were pressed.
     settings: dict[str, Any] = {"scene": scene, "level": level, "budget": MAP_SIDE**2}
@@ -141,7 +143,7 @@ def record_faces(
         faces += _record_batch(envs, [FIRST_SEED + len(faces) + lane for lane in range(LANES)])
         progress(len(faces))
     envs.close()
-    return RecordedFaces(**{name: np.stack([one[name] for one in faces]) for name in faces[0]})
+    return RecordedFaces(**{name: np.stack([face[name] for face in faces]) for name in faces[0]})
 
 
 def _record_batch(envs: gym.vector.VectorEnv, seeds: list[int]) -> list[dict[str, Any]]:

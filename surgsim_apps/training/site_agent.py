@@ -1,4 +1,4 @@
-"""Agents for SurgSim/PalpateSites-v0: their interface, what they may know, and the belief that presses give them."""
+"""Agents for SurgSim/PalpateSites-v0: their interface, the facts of an episode, and their belief after presses."""
 
 import math
 from dataclasses import dataclass
@@ -11,14 +11,12 @@ from msdm_core.arithmetic import matmul
 from surgsim_env.palpation import BACKGROUND_SPREAD, EXCESS_SPREAD, MAP_SIDE, TouchMap, contrast_process
 from surgsim_env.tasks import PalpateSitesTask, channel_slices
 
-# Sites nearer to the chart's border than this share of its side are not pressed: half of the area that a press there
-# informs about can hold no lesion.
+# Least distance of a press from the chart's border, over its side: nearer ones inform about much area without lesions.
 BORDER = 0.07
 # Share of the estimator's correlation length: with the whole of it, weak lesions between two presses are overlooked.
 LENGTH_SHARE = 0.8
 # On a chart of at most FIRST_LENGTHS correlation lengths the first four presses are a raster of 2 x 2, at these shares
-# of its sides: they estimate the background and leave no quarter unpressed, where a process without data takes any
-# place.
+# of its sides: they estimate the background and leave no quarter unpressed; a process without data takes any place.
 FIRST_SHARES = ((0.25, 0.25), (0.75, 0.75), (0.75, 0.25), (0.25, 0.75))
 FIRST_LENGTHS = 6.0
 
@@ -40,14 +38,14 @@ OBSERVATION_SIZE = max(part.stop for part in SLICES.values())
 
 @dataclass(frozen=True, eq=False)
 class SiteFacts:
-    """What an episode does not change: the palpable face, the tip and the sensor. All of it is in the observation.
+    """Constants of an episode, all in the observation: the palpable face, the tip and the sensor.
 
     Fields:
         map: the sites of the touch map; lengths in metres, or in tip radii with a tip_radius of 1
-        tip_radius: of the ball that presses [m]
-        lesion_radius: mean radius of the lesions that are looked for [m]
+        tip_radius: of the pressing ball [m]
+        lesion_radius: mean radius of the lesions [m]
         noise: standard deviation of one log contrast by the force sensor
-        excess_least: least excess of the log contrast that the estimator takes for a lesion
+        excess_least: the estimator's least excess of the log contrast of a lesion
         budget: presses of an episode
     """
 
@@ -69,7 +67,7 @@ class SiteFacts:
         return self.map.sites
 
     def action(self, place: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The action that presses at a place of the chart [m], shape (2,)."""
+        """The action for a press at a place of the chart [m], shape (2,)."""
         return np.clip(2.0 * np.asarray(place) / self.extent - 1.0, -1.0, 1.0).astype(np.float32)
 
 
@@ -80,7 +78,7 @@ def remembered(observation: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDA
 
 
 def observed_facts(observation: NDArray[np.floating]) -> SiteFacts:
-    """The facts that an observation with memory holds, lengths in tip radii."""
+    """Facts in an observation with memory, lengths in tip radii."""
     cell, share, noise, least, radius = (np.asarray(observation[SLICES[name]], dtype=np.float64) for name in FACTS)
     face = np.asarray(observation[SLICES["face_map"]]) > 0.5
     observed_map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)
@@ -88,19 +86,19 @@ def observed_facts(observation: NDArray[np.floating]) -> SiteFacts:
 
 
 class SiteAgent(Protocol):
-    """Chooses where to press next; one agent plays one environment."""
+    """An agent for the choice of presses in one environment."""
 
     def reset(self, rng: np.random.Generator, facts: SiteFacts) -> None:
         """Begin an episode."""
         ...
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Where to press next: an action, shape (2,)."""
+        """The next press: an action, shape (2,)."""
         ...
 
 
 def site_facts(env: Any) -> SiteFacts:
-    """The facts of an environment (its wrappers do not matter)."""
+    """Facts of an environment, without its wrappers."""
     task = env.unwrapped.task
     charted, estimator = task.charted, task.estimator
     return SiteFacts(
@@ -124,7 +122,7 @@ class Belief:
 class SiteProcess:
     """The estimator's Gaussian process on the sites of a map, with LENGTH_SHARE of its correlation length.
 
-    `candidates` says which sites an agent chooses among: those that may be pressed, off the border, shape (n n,).
+    `candidates` is the mask of an agent's choices: pressable sites off the border, shape (n n,).
     """
 
     def __init__(self, facts: SiteFacts) -> None:
@@ -136,7 +134,7 @@ class SiteProcess:
         self.candidates = facts.map.pressable & (from_border.min(axis=1) >= BORDER)
 
     def belief(self, observation: NDArray[np.floating]) -> Belief:
-        """The belief given all presses that an observation remembers.
+        """The belief given all presses in an observation.
 
         It is about the excess alone: uncertainty of the background, the same at all sites, should attract no press.
         """
@@ -147,9 +145,9 @@ class SiteProcess:
     def best(
         self, worth: NDArray[np.float64], observation: NDArray[np.floating], rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """The action for the candidate of most worth (n n,) that was not pressed yet; ties are broken at random.
+        """The action for the fresh candidate of most worth (n n,); ties are broken at random.
 
-        Where all were pressed, one of them again.
+        If all were pressed, one of them again.
         """
         pressed, _ = remembered(observation)
         fresh = self.candidates.copy()
@@ -158,7 +156,7 @@ class SiteProcess:
         return self.facts.action(self.facts.sites[rng.choice(np.flatnonzero(worth >= worth.max() - 1e-9))])
 
     def first(self, number: int) -> NDArray[np.float32] | None:
-        """The action of press `number` (from 0) if the first raster has it, on the candidate nearest to its place."""
+        """The action of press `number` (from 0) of the first raster, on the candidate nearest to its place, or None."""
         if number >= len(FIRST_SHARES) or max(self.facts.extent) > FIRST_LENGTHS * self.process.length:
             return None
         squared = np.square(self.facts.sites - np.array(FIRST_SHARES[number]) * self.facts.extent).sum(axis=1)
@@ -168,8 +166,8 @@ class SiteProcess:
 class GrowingBelief:
     """`SiteProcess.belief` after presses at sites of the map, one after the other, much faster.
 
-    Each press adds a row of the covariance's Cholesky factor (Rasmussen & Williams 2006, section 2.2): a press costs as
-    many operations as there are presses times sites.
+    Each press adds a row of the covariance's Cholesky factor (Rasmussen & Williams 2006, section 2.2), in presses times
+    sites operations.
     """
 
     def __init__(self, process: SiteProcess, press_count: int) -> None:

@@ -1,4 +1,4 @@
-"""A surrogate of SurgSim/PalpateSites-v0 that looks contrasts up: its faces are drawn, or recorded from organs.
+"""A surrogate of SurgSim/PalpateSites-v0 with tabulated contrasts of faces, drawn or recorded from organs.
 
 Touch map, estimator, score and rewards of finding are the environment's; there are no forces.
 """
@@ -19,7 +19,7 @@ from surgsim_env.tasks import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateS
 
 @dataclass(frozen=True, eq=False)
 class SurrogateFace:
-    """The palpable face of one episode, and what a press at each of its sites feels.
+    """The palpable face of one episode, with the contrast at each of its sites.
 
     Fields:
         map: its sites, lengths in tip radii
@@ -67,11 +67,11 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.memory[SLICES["excess_least"]] = face.estimator.excess_least
         self.memory[SLICES["lesion_radius"]] = face.estimator.lesion_radius / face.tip_radius
         self.memory[SLICES["presses_left"]] = 1.0
-        self.error, self.found = self._judged()
+        self.error, self.found_share = self._judged()
         return self.memory.copy(), {"error_mm": 1000.0 * self.error}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Press at the site of the map that is nearest to a place of the chart and may be pressed."""
+        """Press at the pressable site of the map nearest to a place of the chart."""
         face = self.face
         asked = 0.5 * (np.asarray(action, dtype=np.float64) + 1.0) * face.map.extent
         squared = ((face.map.sites - asked) ** 2).sum(axis=1)
@@ -81,17 +81,17 @@ class SiteSurrogate(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.values.append(value)
         self.memory[SLICES["contrast_map"]][site], self.memory[SLICES["pressed_map"]][site] = value, 1.0
         self.memory[SLICES["presses_left"]] = 1.0 - len(self.sites) / self.budget
-        found_before = self.found
-        self.error, self.found = self._judged()
+        share_before = self.found_share
+        self.error, self.found_share = self._judged()
         weights = reward_weights(PalpateSitesTask)
         reward = weights["error"] * self.error / self.cutoff / self.budget
-        reward += weights["found"] * (self.found - found_before)
+        reward += weights["found"] * (self.found_share - share_before)
         over = len(self.sites) >= self.budget
         success = over and self.error <= SUCCESS_ERROR * face.tip_radius / REFERENCE_TIP
         return self.memory.copy(), reward, over, False, {"error_mm": 1000.0 * self.error, "success": success}
 
     def _judged(self) -> tuple[float, float]:
-        """Error of the estimate (OSPA) [m], and the share of lesions with an estimate near them."""
+        """Error of the estimate (OSPA) [m], and the share of lesions near an estimate."""
         face = self.face
         places = face.map.sites[self.sites] * face.tip_radius
         points = face.surface(face.estimator.estimate(places, np.array(self.values)).points)

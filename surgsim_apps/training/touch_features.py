@@ -8,7 +8,7 @@ from surgsim_env.tasks import LENGTH_SCALE, PalpateTask, channel_slices
 
 # Radius of the blocks' tip [m].
 TIP_RADIUS = 0.008
-# Reach of the search over sites that were not felt, in the unit of positions.
+# Reach of the search over unfelt sites, in the unit of positions.
 SEARCH_REACH = 0.8
 # A press is about a quarter of the soft limit, and a lesion about a quarter stiffer than the tissue around it.
 GAIN = 4.0
@@ -24,12 +24,11 @@ CHANNELS = channel_slices(
 class TouchSummary(nn.Module):
     """16 numbers of order 1.
 
-    Tip position (3), force along z (1, times 4), time left (1), stiffest place and contrast (3), share of the face that
-    was felt (1), whether anything was (1), mean contrast c of the sites felt (1), the excess of the stiffest over it,
-    4 (c_max / c - 1) (1); the way from the tip to the stiffest place (2), and to the centroid of the sites not felt
-    weighted by exp(-(d / 8 mm)^2 / 2) of their distance d, the direction of a search (2). Ways are about right on a
-    block whose middle is that of the workspace, under a tip of 8 mm radius. The observation is that of the environment,
-    not normalised.
+    Tip position (3), force along z (1, times 4), time left (1), stiffest place and contrast (3), felt share of the face
+    (1), 1 after the first touch (1), mean contrast c of felt sites (1), the excess of the stiffest over it,
+    4 (c_max / c - 1) (1); the way from the tip to the stiffest place (2), and to the centroid of unfelt sites weighted
+    by exp(-(d / 8 mm)^2 / 2) of their distance d, the direction of a search (2). Ways are about right on a block in the
+    middle of the workspace, under a tip of 8 mm radius. The observation is not normalised.
     """
 
     features_dim = 16

@@ -60,7 +60,7 @@ def faces() -> Iterator[Row]:
         values = np.append(directions, equibiaxial)
         yield compare(
             f"membrane capsule on a block's face, cell {1e3 * SIZE / cells:.1f} mm", "E_c h_c", expected=STIFFNESS,
-            measured=float(values[np.argmax(np.abs(values - STIFFNESS))]), tolerance=FACE_TOLERANCE, unit="N/m",
+            measured=values[np.argmax(np.abs(values - STIFFNESS))], tolerance=FACE_TOLERANCE, unit="N/m",
             note="the worst of equibiaxial and 12 directions",
         )  # fmt: skip
 
@@ -118,7 +118,7 @@ def pulled() -> Iterator[Result]:
             )  # fmt: skip
         for label, values in ((f"capsule by {rule}", stiffness), (f"reference, {rule}", expected)):
             labels = ("cell [mm]", "membrane stiffness [N/m]", False)
-            yield Curve("capsule", label, tuple(1e3 * size for size in sizes), tuple(values), *labels)
+            yield Curve("capsule", label, 1e3 * np.array(sizes), values, *labels)
     # The paper's layer consists of the tets with a face on the boundary: its thickness in cells.
     mesh, area = meshes[0], 6.0 * SIZE**2
     touching = np.isin(mesh.tets, mesh.boundary_nodes).any(axis=1)

@@ -116,7 +116,7 @@ def sliding() -> Iterator[Row]:
         jump = float((np.linalg.norm(np.diff(force, axis=0), axis=1) / np.linalg.norm(force[1:], axis=1)).max())
         yield compare(
             f"sliding {line}, largest jump between haptic steps", "continuity", expected=0.0, measured=jump,
-            tolerance=JUMP_TOLERANCE, absolute=True,
+            tolerance=JUMP_TOLERANCE,
             note=f"share of the force; tip 8 mm, 4 mm deep, {1e3 * SPEED:g} mm/s, friction {friction:g}",
         )  # fmt: skip
         shallow, _, _ = slide(touch, line, 0.0015)
@@ -156,7 +156,7 @@ def sticking() -> Row:
     after = touch.move(state, shapes, (0.0, 0.0, 0.0), 500)[-1]
     return compare(
         "sticking, change of the force in 0.5 s", "no creep", expected=0.0,
-        measured=float(np.linalg.norm(after - before) / before[2]), tolerance=1e-4, absolute=True,
+        measured=np.linalg.norm(after - before) / before[2], tolerance=1e-4,
         note=f"share of the normal force; friction holds {-before[0] / before[2]:.2f} of it, mu 0.8",
     )  # fmt: skip
 
@@ -361,12 +361,12 @@ def on_supports() -> Iterator[Row]:
     force = support_forces(model, rest_state(model)).sum(axis=0)
     yield compare(
         "block on a plane, force of the support", "statics: the weight",
-        expected=float(model.node_mass.sum()) * GRAVITY, measured=float(force[2]), tolerance=1e-3, unit="N",
+        expected=float(model.node_mass.sum()) * GRAVITY, measured=force[2], tolerance=1e-3, unit="N",
         note=f"40 x 40 x 20 mm, cell 5 mm; across it {np.hypot(*force[:2]):.1g} N",
     )  # fmt: skip
     yield compare(
         "block on an incline of 20 degrees, creep in 0.5 s", "Coulomb: at rest where tan a < mu", expected=0.0,
-        measured=crept(np.radians(20.0), 0.4), tolerance=1e-7, unit="m", absolute=True,
+        measured=crept(np.radians(20.0), 0.4), tolerance=1e-7, unit="m",
         note="mu 0.4, tan a = 0.364; the node that moves most",
     )  # fmt: skip
     for degrees, friction in SLIDES:
@@ -374,7 +374,7 @@ def on_supports() -> Iterator[Row]:
         path, speed = slid(tilt, friction)
         yield compare(
             f"block on an incline of {degrees:g} degrees, mu {friction:g}, acceleration",
-            "Coulomb: g (sin a - mu cos a)", expected=float(GRAVITY * (np.sin(tilt) - friction * np.cos(tilt))),
+            "Coulomb: g (sin a - mu cos a)", expected=GRAVITY * (np.sin(tilt) - friction * np.cos(tilt)),
             measured=path, tolerance=0.02, unit="m/s^2",
             note=f"from the path in {SLIDING_TIME:g} s from rest; {speed:.4g} m/s^2 from the speed at its end",
         )  # fmt: skip

@@ -138,9 +138,9 @@ def contrast(count: int, nu: float, hidden: tuple[Hidden, ...], curve: str = "")
         rows.append(row)
     yield from rows
     if curve:
-        covers, labels = tuple(1e3 * sphere.cover for sphere in hidden), ("cover [mm]", "contrast, k / k0 - 1", False)
-        yield Curve(curve, f"springs, nu {nu:.2f}", covers, tuple(row.measured for row in rows), *labels)
-        yield Curve(curve, f"reference, nu {nu:.2f}", covers, tuple(row.expected for row in rows), *labels)
+        covers, labels = [1e3 * sphere.cover for sphere in hidden], ("cover [mm]", "contrast, k / k0 - 1", False)
+        yield Curve(curve, f"springs, nu {nu:.2f}", covers, [row.measured for row in rows], *labels)
+        yield Curve(curve, f"reference, nu {nu:.2f}", covers, [row.expected for row in rows], *labels)
 
 
 def graded_punch() -> Iterator[Row]:

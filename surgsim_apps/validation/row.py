@@ -1,12 +1,13 @@
 """Results of a validation case: rows of the table, curves of plots, drawings."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, SupportsFloat
 
 import numpy as np
+from numpy.typing import NDArray
 
 Verdict = Literal["met", "not met", "skipped"]
 
@@ -39,14 +40,14 @@ class Row:
     note: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """Line of a plot; `figure` is the plot's name."""
 
     figure: str
     label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
+    x: Sequence[float] | NDArray[np.floating]
+    y: Sequence[float] | NDArray[np.floating]
     x_label: str = "cell [mm]"
     y_label: str = "size of the error"
     logarithmic: bool = True
@@ -78,14 +79,19 @@ def compare(
     case: str,
     source: str,
     *,
-    expected: float,
-    measured: float,
+    expected: SupportsFloat,
+    measured: SupportsFloat,
     tolerance: float,
     unit: str = "",
     absolute: bool = False,
     note: str = "",
 ) -> Row:
-    """Row with the verdict by error and tolerance; a number that is not finite is not met."""
+    """Row with the verdict by error and tolerance; a number that is not finite is not met.
+
+    The error is absolute if asked for, or if the expected value is 0.
+    """
+    expected, measured = float(expected), float(measured)
+    absolute = absolute or expected == 0.0
     error = measured - expected if absolute else measured / expected - 1.0
     verdict: Verdict = "met" if math.isfinite(error) and abs(error) <= tolerance else "not met"
     return Row(case, source, expected, measured, error, tolerance, verdict, unit, absolute, note)
@@ -95,14 +101,14 @@ def bounded(
     case: str,
     source: str,
     *,
-    measured: float,
+    measured: SupportsFloat,
     least: float = -math.inf,
     most: float = math.inf,
     unit: str = "",
     note: str = "",
 ) -> Row:
     """Row with a bound of the measured value on one side, shown as expected."""
-    bound = least if math.isfinite(least) else most
+    measured, bound = float(measured), least if math.isfinite(least) else most
     verdict: Verdict = "met" if least <= measured <= most else "not met"
     side = "verdict: at least that" if math.isfinite(least) else "verdict: at most that"
     text = f"{side}; {note}" if note else side
@@ -122,4 +128,4 @@ def with_order(name: str, sizes: list[float], rows: list[Row]) -> Iterator[Resul
         f"{name}, order of the error", "springs cut at a surface: O(cell)", 1.0, order, order - 1.0, math.inf, verdict,
         absolute=True, note="verdict: the error falls on every finer mesh",
     )  # fmt: skip
-    yield Curve("convergence", name, tuple(1e3 * size for size in sizes), tuple(errors.tolist()))
+    yield Curve("convergence", name, 1e3 * np.array(sizes), errors)

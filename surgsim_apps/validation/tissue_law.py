@@ -116,7 +116,7 @@ def large_strain(test: Test, cells: int, stiffening: Stiffening | None) -> Itera
             )  # fmt: skip
         figure, labels = f"cube_{law}_{'sheared' if test == 'shear' else TESTS[test]}", ("strain", "force [N]", False)
         for label, force in (("organ", measured), ("reference", reference)):
-            yield Curve(figure.replace(" ", "_"), f"{label}, {name}", signed, tuple(force), *labels)
+            yield Curve(figure.replace(" ", "_"), f"{label}, {name}", signed, force, *labels)
 
 
 def ellipticity() -> Iterator[Row]:
@@ -159,15 +159,15 @@ def all_directions() -> Iterator[Result]:
             shown = 200.0 * strain if name == "sheared" else 100.0 * strain
             yield compare(
                 f"springs of the lattice, {name} along an axis by {shown:.0f} %", "springs in all directions",
-                expected=float(stress(isotropic, np.array([size]))[0]),
-                measured=float(stress(lattice, np.array([size]))[0]), tolerance=LARGE_TOLERANCE, unit="Pa",
+                expected=stress(isotropic, np.array([size]))[0],
+                measured=stress(lattice, np.array([size]))[0], tolerance=LARGE_TOLERANCE, unit="Pa",
                 note=f"{STIFFENING}",
             )  # fmt: skip
     strain, labels = np.linspace(-0.3, 0.3, 31), ("strain", "stress [Pa]", False)
     for solid, springs in ((lattice, "springs of the lattice"), (isotropic, "springs in all directions")):
         along, shear = uniaxial_stress(solid, 1.0 + strain), simple_shear_stress(solid, strain)
         for name, stress in (("along an axis", along), ("shear", shear)):
-            yield Curve("stiffening", f"{springs}, {name}", tuple(strain.tolist()), tuple(stress.tolist()), *labels)
+            yield Curve("stiffening", f"{springs}, {name}", strain, stress, *labels)
 
 
 def advance_freely(model: OrganModel, state: OrganState, duration: float) -> None:
@@ -201,7 +201,7 @@ def step_strain(arms: Relaxation, stiffening: Stiffening | None = None) -> Itera
         force = float(state.node_force[top, 0].sum() / start.node_force[top, 0].sum())
         yield compare(
             f"step strain, {law} springs, after {time:g} s", "1 + sum g exp(-t / tau)",
-            expected=float(arms.remaining(time)), measured=force,
+            expected=arms.remaining(time), measured=force,
             tolerance=RELAXED_TOLERANCE, note="force over the elastic one",
         )  # fmt: skip
 
@@ -239,7 +239,7 @@ def creep(arms: Relaxation, poisson_ratio: float) -> Iterator[Row]:
         before = time
         measured = float((state.node_position - model.node_rest_position)[top, 2].mean() / sinking)
         yield compare(
-            f"creep, nu {poisson_ratio:.2f}, after {time:g} s", source, expected=float(share), measured=measured,
+            f"creep, nu {poisson_ratio:.2f}, after {time:g} s", source, expected=share, measured=measured,
             tolerance=RELAXED_TOLERANCE, note="sinking of the top over the elastic one",
         )  # fmt: skip
 
@@ -306,5 +306,5 @@ def held_press(cells: int) -> Iterator[Result]:
             note="tip 8 mm pressed 2 mm at 40 mm/s; the reference has small strains",
         )  # fmt: skip
     labels = ("time held [s]", "force [N]", False)
-    yield Curve("press_held", f"organ, cell {60.0 / cells:.1f} mm", HOLD_TIMES, tuple(measured), *labels)
-    yield Curve("press_held", "reference", HOLD_TIMES, tuple(expected), *labels)
+    yield Curve("press_held", f"organ, cell {60.0 / cells:.1f} mm", HOLD_TIMES, measured, *labels)
+    yield Curve("press_held", "reference", HOLD_TIMES, expected, *labels)

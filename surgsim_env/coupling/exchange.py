@@ -134,7 +134,7 @@ def steps_taken(model: OrganModel, state: OrganState, outcome: StepOutcome, lane
 
 
 def describe(model: OrganModel, state: OrganState, wrench: FloatArray, fault: int) -> str:
-    """One sentence on a FAULT_ code of a haptic step; `wrench` (n_tool, 6) is that of the step with the fault."""
+    """One sentence on a FAULT_ code of a haptic step, from the wrench (n_tool, 6) of that step."""
     if fault == FAULT_WRENCH_NOT_FINITE:
         return "the contact wrench is not finite"
     if fault == FAULT_FORCE_CAP:

@@ -31,7 +31,7 @@ FAULT_FORCE_CAP = 102
 
 
 class StepPlan(NamedTuple):
-    """What the haptic steps of one call have in common.
+    """Settings of the haptic steps of one call.
 
     Fields:
         dt: duration of a substep [s]
@@ -51,7 +51,7 @@ class StepPlan(NamedTuple):
 
 
 class StepOutcome(NamedTuple):
-    """What haptic steps result in, lane by lane; one organ alone is one lane.
+    """Results of haptic steps, lane by lane; one organ alone is one lane.
 
     Fields:
         wrench: of the last good step [N, N m]                                   (n_lane, n_tool, 6)

@@ -1,4 +1,4 @@
-"""Simulations of one scene that advance side by side in one compiled call, with the same results as alone."""
+"""Simulations of one scene side by side in one compiled call, with the same results as alone."""
 
 import math
 import os
@@ -25,7 +25,7 @@ from surgsim_env.coupling.simulation import Simulation
 
 
 def core_count() -> int:
-    """Number of cores that this process may use."""
+    """Number of cores of this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -46,7 +46,7 @@ class LaneGroup:
         self._dtype, self._lanes = dtype, lanes
         self._stack()
         count = len(self._model.lanes)
-        self._shapes = stack_shapes([one.instrument.shapes for one in self.simulations], count)
+        self._shapes = stack_shapes([simulation.instrument.shapes for simulation in self.simulations], count)
         tools = first.instrument.tool_count
         self._response = lane_responses(tools, count)
         self._outcome = step_outcome(count, tools)
@@ -62,8 +62,8 @@ class LaneGroup:
             RuntimeError: one of them is being recorded.
         """
         if not self._own_rest and not all(
-            one.organ_model is known or same_rest(one.organ_model, self._organs[0])
-            for one, known in zip(self.simulations, self._organs, strict=True)
+            simulation.organ_model is known or same_rest(simulation.organ_model, self._organs[0])
+            for simulation, known in zip(self.simulations, self._organs, strict=True)
         ):
             self._stack()
         for lane, simulation in enumerate(self.simulations):
@@ -72,10 +72,10 @@ class LaneGroup:
             else:
                 self._state.lane_fault[lane] = LANE_EMPTY
         first = self.simulations[0]
-        views = [one.instrument.views(compiled=True) for one in self.simulations]
+        views = [simulation.instrument.views(compiled=True) for simulation in self.simulations]
         # Always as many as there are lanes: numba would compile another number anew.
         views += [views[-1]] * (len(self._outcome.step_count) - len(views))
-        drives = [one.drive for one in self.simulations]
+        drives = [simulation.drive for simulation in self.simulations]
         drives += [drives[-1]] * (len(self._outcome.step_count) - len(drives))
         plan = step_plan(self._model.alpha, first.substep_dt, first.substep_count, count, force_limit, pull_limit)
         outcome = self._outcome._replace(stopped=self._state.lane_fault)
@@ -96,11 +96,11 @@ class LaneGroup:
 
     def _stack(self) -> None:
         """Make lanes for the present organs of the simulations."""
-        self._organs: list[OrganModel] = [one.organ_model for one in self.simulations]
+        self._organs: list[OrganModel] = [simulation.organ_model for simulation in self.simulations]
         self._own_rest = not all(same_rest(self._organs[0], organ) for organ in self._organs)
         settings: dict[str, Any] = {"dtype": self._dtype, "lanes": self._lanes, "own_rest": self._own_rest}
         self._model = stack_organs(self._organs, **settings)
-        self._state = lanes_of([one.organ_state for one in self.simulations], self._organs[0], **settings)
+        self._state = lanes_of([simulation.organ_state for simulation in self.simulations], self._organs[0], **settings)
 
     def _load(self, lane: int, simulation: Simulation) -> None:
         simulation.begin_in_lanes()

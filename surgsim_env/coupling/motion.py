@@ -57,7 +57,7 @@ def hold(drive: MotionDrive, stopping: Sequence[int], time: float) -> MotionDriv
 
 
 def go_on(drive: MotionDrive, drawn_size: FloatArray, stopping: Sequence[int], time: float) -> MotionDrive:
-    """The drive of `hold` from a time [s] on, again with the sizes that were drawn (n_motion, n_cycle)."""
+    """The drive of `hold` from a time [s] on, again with the drawn sizes (n_motion, n_cycle)."""
     delay = drive.delay.copy()
     for number in stopping:
         if signal_at(drive, number, time) == 0.0:
@@ -66,5 +66,5 @@ def go_on(drive: MotionDrive, drawn_size: FloatArray, stopping: Sequence[int], t
 
 
 def still(haptic_step: float) -> MotionDrive:
-    """The drive of an organ that nothing moves."""
+    """The drive of an organ without motions."""
     return draw_drive((), haptic_step, np.random.default_rng(0))

@@ -59,7 +59,7 @@ LOOP_VARIABLE = "SURGSIM_LOOP"
 
 
 def runs_compiled() -> bool:
-    """Whether a new simulation runs compiled: unless LOOP_VARIABLE or a missing library prevents it.
+    """True unless LOOP_VARIABLE or a missing library makes new simulations run in Python.
 
     Raises:
         ValueError: the variable is neither "compiled" nor "python".
@@ -72,7 +72,7 @@ def runs_compiled() -> bool:
 
 @cache
 def _warn_of_missing_library(missing: str) -> bool:
-    """Warn once that control steps run in Python, and why; False if nothing is missing."""
+    """Warn once of control steps in Python, with the reason; False if nothing is missing."""
     if missing:
         warnings.warn(f"control steps run in the plain Python loop, more slowly: {missing}", RuntimeWarning, 2)
     return bool(missing)

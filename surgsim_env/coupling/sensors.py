@@ -1,4 +1,4 @@
-"""The force sensor: bias, noise and range between the simulated force and what is observed."""
+"""The force sensor: bias, noise and range between the simulated and the observed force."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -1,4 +1,4 @@
-"""The simulation: an organ and an instrument that exchange forces at haptic rate, the clock, and recordings of both."""
+"""The simulation: force exchange of an organ and an instrument at haptic rate, the clock, and recordings of both."""
 
 import math
 from bisect import bisect_left
@@ -69,7 +69,7 @@ class HapticRecord:
         self._orientation.append(orientation)
 
     def first_contact(self, start: int = 0) -> int | None:
-        """Index of the first step from `start` on in which a tool touched the tissue; None without one."""
+        """Index of the first step of contact from `start` on; None without one."""
         later = bisect_left(self._touching, start)
         return self._touching[later] if later < len(self._touching) else None
 
@@ -135,7 +135,7 @@ class Simulation:
         self.force_peak = self.pull_peak = 0.0
         self._record: HapticRecord | None = None
         # The motions that stop in apnoea.
-        self._breath = [number for number, one in enumerate(scene.motions) if one.stops_in_apnoea]
+        self._breath = [number for number, motion in enumerate(scene.motions) if motion.stops_in_apnoea]
         self.draw_motion(np.random.default_rng(0))
         self.organ_model: OrganModel
         self.organ_state: OrganState
@@ -184,7 +184,7 @@ class Simulation:
         return (weights[:, :, None] * points).sum(axis=(0, 1)) / weights.sum()
 
     def take_anatomy(self, anatomy: Anatomy) -> None:
-        """Go on with another member of the scene's family; its organ comes with the `reset` that follows."""
+        """Go on with another member of the scene's family; its organ comes with the next `reset`."""
         self.anatomy = anatomy
 
     def reset(self, organ_model: OrganModel, tip_position: FloatArray, *, elapsed: float = 0.0) -> None:
@@ -283,7 +283,7 @@ class Simulation:
             self._record = None
 
     def begin_in_lanes(self) -> None:
-        """Begin a control step that a group of lanes computes.
+        """Begin a control step in a group of lanes.
 
         Raises:
             RuntimeError: the simulation is being recorded, and these steps would be missing.
@@ -294,7 +294,7 @@ class Simulation:
         self.begin_motion()
 
     def end_in_lanes(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
-        """End a control step that a group of lanes has computed; the instrument's own data have been advanced too.
+        """End a control step in a group of lanes, which has advanced the instrument's own data.
 
         Args:
             organ_state: the organ's state after it.
@@ -324,11 +324,11 @@ class Simulation:
 
     @property
     def holds_breath(self) -> bool:
-        """Whether motions that stop in apnoea rest, or will after their present cycle."""
+        """True where the motions of breath rest, or will after their present cycle."""
         return not np.array_equal(self.drive.cycle_size, self._drawn.cycle_size)
 
     def hold_breath(self, held: bool) -> None:
-        """Let the motions that stop in apnoea rest after their present cycle (True), or begin a new one (False)."""
+        """Let the motions of breath rest after their present cycle (True), or begin a new one (False)."""
         if held and not self.holds_breath:
             self._hold()
         elif not held and self.holds_breath:
@@ -343,7 +343,7 @@ class Simulation:
         self._place_supports()
 
     def ground_shift(self, points: ArrayLike, elapsed: float | None = None) -> FloatArray:
-        """How far the motions have moved the ground from where it was at rest [m], of the shape of the points.
+        """Displacement of the ground from rest by the motions [m], of the shape of the points.
 
         Args:
             points: of the organ at rest [m], shape (n, 3) or (3,).
@@ -356,14 +356,14 @@ class Simulation:
         return shift
 
     def _place_supports(self) -> None:
-        """Move the supports that tools meet with the ground; they stay there until it is called again."""
+        """Move the tools' supports with the ground; they stay there until the next call."""
         supports = self.anatomy.scene.supports
         if supports and self.anatomy.scene.motions:
-            shift = self.ground_shift(np.array([one.position for one in supports]))
+            shift = self.ground_shift(np.array([support.position for support in supports]))
             place_supports(self.instrument.model, self.instrument.data, supports, shift)
 
     def _hold(self) -> None:
-        """Let the breath end its present cycle; once that is over no cycle is left, as they all come again."""
+        """Let the breath end its present cycle and have none left afterwards, since cycles repeat."""
         self.drive = hold(self.drive, self._breath, self.motion_time)
         self._breath_ends = bool(self.drive.cycle_size[self._breath].any())
 
@@ -373,7 +373,7 @@ class Simulation:
         self.hold_breath(held)
 
     def _rest_on_ground(self) -> None:
-        """Move the resting organ with its ground to where the motions have it at the start of the clock."""
+        """Move the resting organ with its ground to its place at the start of the clock."""
         if not self.anatomy.scene.motions:
             return
         start = self._motion_start * self.haptic_dt
@@ -393,7 +393,7 @@ class Simulation:
         return not self.fault
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that changes, as arrays by name; the caller keeps the organ's model."""
+        """All changing quantities, as arrays by name; the caller keeps the organ's model."""
         arrays = {f"organ_{name}": getattr(self.organ_state, name).copy() for name in self._kept_fields}
         motion = {f"motion_{name}": getattr(self.drive, name).copy() for name in DRAWN_FIELDS}
         motion["motion_cycle_size_drawn"] = self._drawn.cycle_size.copy()
@@ -412,7 +412,7 @@ class Simulation:
         }
 
     def set_state(self, organ_model: OrganModel, arrays: Mapping[str, np.ndarray]) -> None:
-        """Restore arrays from `get_state`, to the bit; arrays that are refused change nothing.
+        """Restore arrays from `get_state`, to the bit; refused arrays change nothing.
 
         Args:
             organ_model: the organ that they belong to, of this scene.
@@ -445,7 +445,7 @@ class Simulation:
 
     @property
     def _kept_fields(self) -> tuple[str, ...]:
-        """KEPT_NAMES, without those of motions where nothing moves the organ."""
+        """KEPT_NAMES, without those of motions for an organ without any."""
         return KEPT_NAMES if self.anatomy.scene.motions else tuple(name for name in KEPT_NAMES if name != "motion")
 
     def _check_step(self, organ_model: OrganModel) -> None:
@@ -460,7 +460,7 @@ class Simulation:
 
 
 def check_entries(arrays: Mapping[str, np.ndarray], like: Mapping[str, np.ndarray]) -> None:
-    """Refuse arrays by name that have other names or shapes than examples.
+    """Refuse arrays of other names or shapes than those of examples.
 
     Raises:
         ValueError: names the entry that is missing, unknown or different, and the rule.

@@ -1,4 +1,4 @@
-"""Where an organ's surface moves with its ground, seen by a camera's markers, and where it will be next."""
+"""Displacement of an organ's surface with its ground, seen by a camera's markers and extrapolated."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ class SurfaceTracker:
     """
 
     def __init__(self, simulation: Simulation, markers: NDArray[np.integer]) -> None:
-        """Watch some nodes (n_marker,) of the present organ, which has moved as it moves now for some pictures."""
+        """Watch some nodes (n_marker,) of the present organ, as if it had moved at its velocity for some pictures."""
         self._simulation, self._markers = simulation, markers
         self._rest = simulation.rest_position[markers]
         state = simulation.organ_state
@@ -45,6 +45,6 @@ class SurfaceTracker:
         return np.median(self._simulation.organ_state.node_position[self._markers] - self._rest, axis=0)
 
     def _before(self, time: float) -> int:
-        """The last picture that was taken by a time [s]."""
+        """Index of the last picture taken by a time [s]."""
         # Times are sums of haptic steps.
         return int(np.searchsorted(self._times, time + 1e-9, side="right")) - 1

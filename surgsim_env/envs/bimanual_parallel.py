@@ -43,7 +43,7 @@ class BimanualRetractParallelEnv(ParallelEnv):
         }
 
     def observation_space(self, agent: str) -> gym.Space:
-        """The space of what both agents observe; always the same object."""
+        """The space of both agents' observation; always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gym.Space:
@@ -92,7 +92,7 @@ class BimanualRetractParallelEnv(ParallelEnv):
         return self.joint.render()
 
     def state(self) -> NDArray[Any]:
-        """The joint observation, which is the same for both."""
+        """The joint observation, equal for both."""
         return self.joint.observation
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The environments' ids: the shipped classes, and tasks of a user's own that become environments."""
+"""The environments' ids: the shipped classes, and environments of a user's own tasks."""
 
 from functools import cache
 from typing import Any
@@ -69,7 +69,7 @@ def __getattr__(name: str) -> Any:
 
 @cache
 def environment_class(task_class: type[Task]) -> type[SurgicalEnv]:
-    """The environment class of a task: a shipped one, or one that is made for it."""
+    """The environment class of a task: a shipped one, or a new one."""
     for shipped in (PalpateEnv, RetractEnv, BimanualRetractEnv, PalpateSitesEnv):
         if shipped.task_class is task_class:
             return shipped

@@ -23,7 +23,7 @@ class PalpateSitesEnv(SurgicalEnv):
         self.phases: tuple[PressPhase, ...] = press_phases(self.scene)
 
     def begin(self, action: FloatArray) -> None:
-        """Put the organ at rest and the tip over the site that a `checked` action (2,) names."""
+        """Put the organ at rest and the tip over the site of a `checked` action (2,)."""
         super().begin(action)
         self._site, task = self.task.site(action), self.task
         self._press = SitePress(
@@ -54,10 +54,10 @@ class PalpateSitesEnv(SurgicalEnv):
         super()._draw()
 
     def _maker(self) -> str:
-        """As `SurgicalEnv._maker`, and the budget, on which observations and rewards depend."""
+        """As `SurgicalEnv._maker`, with the budget: observations and rewards depend on it."""
         return f"{super()._maker()}, budget={self.task.given_budget}"
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
-        """Of the whole press, where a simulation says only whether the instrument is limited at its end."""
+        """As `SurgicalEnv._info`, with workspace_limited of the whole press instead of its end."""
         limited = self._press is not None and self._press.result().workspace_limited
         return {**super()._info(fault, self._saturated, task_info, rewards), "workspace_limited": limited}

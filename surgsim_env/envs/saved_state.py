@@ -1,4 +1,4 @@
-"""Saved states: everything that decides what comes next, as bytes in numpy's own format; nothing in it is executed."""
+"""Saved states: all that the next step depends on, as bytes in numpy's own format without executable parts."""
 
 import io
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ STATE_VERSION = 1
 
 
 def state_maker(kind: str, scene: Scene, mesh: TetMesh) -> str:
-    """Entry in which a saved state and an environment must agree: kind, scene, mesh, rates and version."""
+    """Origin of a saved state, to be equal on loading: kind, scene, mesh, rates and version."""
     return (
         f"{kind} of scene {scene.name!r} ({mesh.node_count} nodes, {mesh.tet_count} tets, "
         f"{scene.timing.substep_count} substeps in {scene.timing.haptic_step:g} s, "

@@ -16,14 +16,14 @@ from stable_baselines3.common.vec_env.base_vec_env import (  # pyright: ignore[r
 
 
 class VectorEnvForStableBaselines(VecEnv):
-    """Environments that are stepped together, behind the interface of stable-baselines3.
+    """A vector environment behind the interface of stable-baselines3.
 
     Both interfaces reset an environment in the step in which its episode ends; the last observation of the episode is
     `info["terminal_observation"]` in stable-baselines3 and `info["final_obs"]` in Gymnasium.
     """
 
     def __init__(self, envs: VectorEnv) -> None:
-        """Take environments that reset in the same step.
+        """Take environments with autoreset in the same step.
 
         Args:
             envs: such as gym.make_vec("SurgSim/Palpate-v0", num_envs=16, vectorization_mode="vector_entry_point",
@@ -40,7 +40,7 @@ class VectorEnvForStableBaselines(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Start an episode everywhere, with the seeds that `seed` has set."""
+        """Start an episode everywhere, with the seeds from `seed`."""
         observation, self.reset_infos = self.envs.reset(seed=list(self._seeds))  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()

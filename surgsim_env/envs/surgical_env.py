@@ -206,7 +206,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self.runtime.begin(action, self.simulation.instrument)
 
     def advance(self, group: Sequence[Any], lanes: LaneGroup | None = None) -> None:
-        """Advance the simulations of a group by what a step lasts: the second part of `step`, once for the group.
+        """Advance the simulations of a group by one control step: the second part of `step`, once for the group.
 
         Args:
             group: environments that have begun the step, this one among them.
@@ -220,7 +220,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             lanes.control_step([env.simulation for env in group], count, *limits)
 
     def finish(self) -> tuple[Observation, float, bool, bool, Info]:
-        """Observe and judge the step: its last part, whose result is that of `step`."""
+        """Observe and judge the step: the last part of `step`, with its result."""
         fault = self.simulation.fault
         saturated = False
         if not fault:
@@ -271,17 +271,17 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     @property
     def observation_slices(self) -> dict[str, slice]:
-        """The entries of an observation that each channel has: `observation[observation_slices["contact_force"]]`."""
+        """Entries of each channel in an observation: `observation[observation_slices["contact_force"]]`."""
         return dict(self.layout.observation_slices)
 
     @property
     def observation(self) -> Observation:
-        """The last observation that reset or step gave."""
+        """The last observation of reset or step."""
         return self._observed()
 
     @property
     def task_observation(self) -> NDArray[np.float32]:
-        """The task's own numbers of that moment in SI units, whatever the arguments leave of them."""
+        """All of the task's own numbers in the last observation, in SI units."""
         return self._observation.copy()
 
     def si_values(self, observations: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -304,7 +304,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self._eye.close()
 
     def save_state(self) -> bytes:
-        """Everything that decides what comes next, as bytes; numpy's own format, nothing in it is executed.
+        """The whole state as bytes, in numpy's own format without executable parts.
 
         Wrappers keep counts of their own (TimeLimit): load a state into an environment that was just reset.
 
@@ -333,7 +333,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._begun, self._running = True, bool(own["running"])
 
     def _own_state(self) -> dict[str, np.ndarray]:
-        """What a saved state holds beside simulation and task, by name."""
+        """The environment's part of a saved state, by name."""
         arrays = {
             "random": np.array(json.dumps(self.np_random.bit_generator.state)),
             "observation": self._observation.copy(),

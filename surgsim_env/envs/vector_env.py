@@ -21,7 +21,7 @@ from surgsim_env.envs.surgical_env import SurgicalEnv
 
 
 class LaneVectorEnv(VectorEnv):
-    """Environments of one scene, stepped together; each gives what it would give alone.
+    """Environments of one scene, stepped together with the same results as alone.
 
     Autoreset modes, infos and spaces are those of Gymnasium's `SyncVectorEnv`. In float64 each environment equals a
     single one to the bit, whatever its neighbours do.
@@ -91,13 +91,13 @@ class LaneVectorEnv(VectorEnv):
 
     @property
     def observation_slices(self) -> dict[str, slice]:
-        """The entries of an observation that each channel has: `observations[:, observation_slices["time_left"]]`."""
+        """Entries of each channel in observations: `observations[:, observation_slices["time_left"]]`."""
         return self.envs[0].observation_slices
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in all environments, or in those that `options={"reset_mask": ...}` names.
+        """Begin an episode in all environments, or in those of `options={"reset_mask": mask}`.
 
         One that is reset is paused no more.
 
@@ -127,7 +127,7 @@ class LaneVectorEnv(VectorEnv):
         return self._together(), infos
 
     def pause(self, mask: NDArray[np.bool_]) -> None:
-        """Leave the environments that a mask (n,) names as they are in each `step`, until a reset of mode "Disabled".
+        """Leave the environments of a mask (n,) as they are in each `step`, until a reset of mode "Disabled".
 
         A step gives of them the last observation, a reward of 0, False for both ends, and no info; their actions are
         not read. So nothing is computed for lanes whose last episode is over.
@@ -181,7 +181,7 @@ class LaneVectorEnv(VectorEnv):
             env.close()
 
     def _checked(self, actions: Any, moves: NDArray[np.bool_]) -> dict[int, FloatArray]:
-        """The actions of the lanes that move (n,), by lane."""
+        """The checked actions of the moving lanes (n,), by lane."""
         values = np.asarray(actions, dtype=np.float64)
         if values.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {values.shape}; the rule is {self.action_space.shape}")
@@ -208,7 +208,7 @@ class LaneVectorEnv(VectorEnv):
 
 
 def enter_info(infos: dict[str, Any], info: Mapping[str, Any], lane: int, count: int) -> None:
-    """Add the info of a lane to that of all: for each name an array (count,), and as "_name" the lanes that have it."""
+    """Add the info of a lane to that of all: for each name an array (count,), and as "_name" the mask of its lanes."""
     for name, value in info.items():
         if isinstance(value, Mapping):
             enter_info(infos.setdefault(name, {}), value, lane, count)
@@ -236,6 +236,6 @@ def __getattr__(name: str) -> Any:
 
 
 def group_width(num_envs: int, dtype: np.dtype, threads: int) -> int:
-    """How many organs a group has: a register full, unless smaller groups keep more threads busy or are enough."""
+    """Number of organs in a group: a full register, unless smaller groups keep more threads busy or are enough."""
     widest, narrowest = lane_counts(dtype)[0], lane_counts(dtype)[-1]
     return narrowest if math.ceil(num_envs / widest) < threads or num_envs <= narrowest else widest

@@ -142,7 +142,7 @@ class _Run:
     def _look(self, start: float, first: int) -> View:
         """Current view, in a step from a time [s] and a number of recorded haptic steps on."""
         simulation, contact = self.inner.simulation, self.record.first_contact(first)
-        instrument = simulation.instrument
+        instrument, force = simulation.instrument, self.layout.observation_slices["contact_force"]
         view = View(
             time=simulation.time,
             step_time=simulation.time - start,
@@ -152,7 +152,7 @@ class _Run:
             tip_velocity=instrument.tip_velocity,
             true_force=simulation.contact_force,
             # From the task's observation, before wrappers and pictures.
-            sensed_force=self.layout.sensed_force(self.inner.task_observation),
+            sensed_force=self.inner.task_observation[force].astype(np.float64),
             contact_position=None if contact is None else self.record.tip_position_at(contact),
             approach=simulation.anatomy.face.approach.copy(),
             grasp=simulation.grasp,

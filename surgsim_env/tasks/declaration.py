@@ -107,7 +107,11 @@ class Channel:
                 )
             object.__setattr__(self, "scale", 1.0)
         if self.sensor:
+            reach = self.sensor
             object.__setattr__(self, "felt", True)
+            object.__setattr__(self, "low", lambda task, _: -reach * task.anatomy.scene.sensor.range)
+            object.__setattr__(self, "high", lambda task, _: reach * task.anatomy.scene.sensor.range)
+            object.__setattr__(self, "bounds_text", "+-range")
             if self.size != 3 or not 0.0 < self.sensor < math.inf:
                 raise ValueError(
                     f"channel {self.name!r}: sensor is {self.sensor!r} with size {self.size!r}; the force sensor has "
@@ -126,8 +130,6 @@ class Channel:
     @property
     def bounds_shown(self) -> str:
         """Its bounds as the table of observations shows them."""
-        if self.low is None or self.high is None:
-            return "+-range"
         if isinstance(self.low, int | float) and isinstance(self.high, int | float):
             return f"+-{self.high:g}" if self.low == -self.high else f"{self.low:g} to {self.high:g}"
         return self.bounds_text

@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -82,26 +81,15 @@ class TaskLayout:
     # ---- observations ------------------------------------------------------------------------------------------
 
     @property
-    def declared(self) -> dict[str, tuple[int, str]]:
-        """Size and scale, as the documentation shows it, of each channel that is observed, by its name."""
-        return {channel.name: (size, channel.scale_shown) for channel, size in self.observed}
-
-    @property
     def force_entries(self) -> list[int]:
         """Indices of the observation that depend on force sensing: those of the channels marked `felt`."""
-        felt = [self.observation_slices[channel.name] for channel, _ in self.observed if channel.felt]
-        return [index for part in felt for index in range(part.start, part.stop)]
+        felt = [channel.felt for channel, size in self.observed for _ in range(size)]
+        return np.flatnonzero(felt).tolist()
 
     def entry_name(self, index: int) -> str:
         """The channel of an entry of the observation, with the place in it: "contact_force[2]"."""
-        for name, part in self.observation_slices.items():
-            if part.start <= index < part.stop:
-                return f"{name}[{index - part.start}]"
-        raise IndexError(f"the observation has no entry {index}")
-
-    def sensed_force(self, observation: NDArray[np.floating]) -> FloatArray:
-        """The force sensor's reading in an observation [N], shape (3,)."""
-        return np.asarray(observation[self.observation_slices["contact_force"]], dtype=np.float64)
+        names = [f"{channel.name}[{place}]" for channel, size in self.observed for place in range(size)]
+        return names[index]
 
     def read(self, simulation: Simulation) -> FloatArray:
         """The observation (n_observation,) in SI units, with the last readings of the sensors.
@@ -128,8 +116,12 @@ class TaskLayout:
         Raises:
             ValueError: a channel whose bounds are not finite, do not fit its size, or are the wrong way round.
         """
-        pairs = [self._channel_bounds(channel, size, instrument) for channel, size in self.observed]
-        return np.concatenate([low for low, _ in pairs]), np.concatenate([high for _, high in pairs])
+        low, high = self._declared("low", instrument), self._declared("high", instrument)
+        for index in np.flatnonzero(low > high).tolist():
+            raise ValueError(
+                f"channel {self.entry_name(index)}: low is {low[index]:g}, above high {high[index]:g}: swap them"
+            )
+        return low, high
 
     def scales(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
         """Origin and scale of each entry of the observation with an instrument, shape (n_observation,) each.
@@ -139,36 +131,24 @@ class TaskLayout:
         Raises:
             ValueError: a channel whose origin or scale is not finite, does not fit its size, or a scale not above 0.
         """
-        origins = [
-            self._entries(channel, size, "origin", channel.origin, instrument) for channel, size in self.observed
-        ]
-        scales = [self._entries(channel, size, "scale", channel.scale, instrument) for channel, size in self.observed]
-        for (channel, _), scale in zip(self.observed, scales, strict=True):
-            if not (scale > 0.0).all():
-                raise ValueError(f"channel {channel.name!r}: scale is {scale.tolist()}; it must be above 0")
-        return np.concatenate(origins), np.concatenate(scales)
+        scale = self._declared("scale", instrument)
+        for index in np.flatnonzero(scale <= 0.0).tolist():
+            raise ValueError(f"channel {self.entry_name(index)}: scale is {scale[index]:g}; it must be above 0")
+        return self._declared("origin", instrument), scale
 
-    def _entries(self, channel: Channel, size: int, what: str, given: Any, instrument: Instrument | None) -> FloatArray:
-        """A bound, an origin or a scale of a channel as an array (size,)."""
-        value = np.asarray(given(self._task, instrument) if callable(given) else given, dtype=np.float64)
-        if value.size not in (1, size) or not np.isfinite(value).all():
-            raise ValueError(
-                f"channel {channel.name!r}: {what} is {value.tolist()}; it must be one finite number or {size}, "
-                f"in {channel.unit or 'its own unit'}"
-            )
-        return np.broadcast_to(value.ravel(), size).copy()
-
-    def _channel_bounds(
-        self, channel: Channel, size: int, instrument: Instrument | None
-    ) -> tuple[FloatArray, FloatArray]:
-        if channel.low is None or channel.high is None:
-            reach = np.full(size, self._task.anatomy.scene.sensor.range * channel.sensor)
-            return -reach, reach
-        low = self._entries(channel, size, "a bound", channel.low, instrument)
-        high = self._entries(channel, size, "a bound", channel.high, instrument)
-        if not (low <= high).all():
-            raise ValueError(f"channel {channel.name!r}: low is {low.tolist()}, above high {high.tolist()}: swap them")
-        return low, high
+    def _declared(self, field: str, instrument: Instrument | None) -> FloatArray:
+        """A bound, the origin or the scale of each entry of the observation, (n_observation,)."""
+        values = []
+        for channel, size in self.observed:
+            declared = getattr(channel, field)
+            value = np.asarray(declared(self._task, instrument) if callable(declared) else declared, dtype=np.float64)
+            if value.size not in (1, size) or not np.isfinite(value).all():
+                raise ValueError(
+                    f"channel {channel.name!r}: {field} is {value.tolist()}; it must be one finite number or {size}, "
+                    f"in {channel.unit or 'its own unit'}"
+                )
+            values.append(np.broadcast_to(value.ravel(), size))
+        return np.concatenate(values)
 
 
 def channel_slices(task_class: type[Task], **sizes: int) -> dict[str, slice]:

@@ -16,7 +16,6 @@ from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Grasp, Instrument
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.levels import Level
 from surgsim_env.scene.load import fill, make_retract_scene
 from surgsim_env.scene.model import Endoscope, Retraction, RetractionCamera, Vector
 from surgsim_env.tasks.channels import (
@@ -91,14 +90,8 @@ class RetractionDraw:
     lesions: ClassVar[tuple[Lesion, ...]] = ()
 
     @classmethod
-    def draw(
-        cls,
-        anatomy: Anatomy,
-        rng: np.random.Generator,
-        level: Level | None = None,
-        lesion_count: int | tuple[int, int] | None = None,
-    ) -> Self:
-        """Draw from the ranges of a scene's [retract] table, around its endoscope; a lobe has no lesions."""
+    def draw(cls, anatomy: Anatomy, rng: np.random.Generator, *_: Any) -> Self:
+        """Draw from the ranges of a scene's [retract] table, around its endoscope; a lobe has no level or lesions."""
         table, endoscope = anatomy.scene.retract, anatomy.scene.endoscope
         assert table is not None and endoscope is not None
         scale, modulus = float(rng.uniform(*table.scale)), float(rng.uniform(*table.youngs_modulus))
@@ -359,7 +352,7 @@ class RetractTask(Task):
         return np.array(self.drawn.start)
 
     def accepts(self, simulation: Simulation) -> bool:
-        """Whether the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
+        """True if the lobe hides the target: at most HIDDEN_SHARE of it is visible."""
         self.look(simulation)
         return self.visible_share <= HIDDEN_SHARE
 

@@ -188,7 +188,7 @@ class TaskRuntime:
         return 1.0 if reward.value is None else reward.value(task, step)
 
     def _damages(self, load: TissueLoad) -> bool:
-        """Whether tissue bears more than the scene's limits of pressure or strain."""
+        """True if a load exceeds the scene's limits of pressure or strain."""
         limits = self.task.limits
         return load.pressure > (limits.pressure or math.inf) or load.strain > (limits.strain or math.inf)
 

@@ -113,7 +113,7 @@ class Task:
         raise NotImplementedError(f"{type(self).__name__} must define draw(rng): it returns the tip's position [m]")
 
     def accepts(self, simulation: Simulation) -> bool:
-        """Whether the episode may begin as drawn, the simulation at rest; if not, another one is drawn."""
+        """True if the episode may begin as drawn, the simulation at rest; else another one is drawn."""
         return True
 
     def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:

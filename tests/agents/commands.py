@@ -8,8 +8,8 @@ from surgsim_apps.cli.main import main
 
 def surgsim(*arguments: str) -> None:
     """Run a command; what it says as an error is raised as a ValueError."""
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said):
+    output = io.StringIO()
+    with contextlib.redirect_stderr(output):
         status = main(arguments)
     if status:
-        raise ValueError(said.getvalue())
+        raise ValueError(output.getvalue())

@@ -42,16 +42,16 @@ def falling(presses: np.ndarray) -> np.ndarray:
 
 def test_the_same_method_differs_by_nothing():
     """The draws are paired: an interval of width 0, however much the episodes differ."""
-    one = result("one", falling(np.random.default_rng(0).integers(1, 12, 40)))
-    for difference in compare(one, replace(one, method="other"), np.random.default_rng(0)):
+    method = result("one", falling(np.random.default_rng(0).integers(1, 12, 40)))
+    for difference in compare(method, replace(method, method="other"), np.random.default_rng(0)):
         assert difference.difference == ScoreEstimate(0.0, 0.0, 0.0), difference
         assert difference.first == difference.second
 
 
 def test_a_method_that_takes_two_presses_more_in_every_episode():
     presses = np.random.default_rng(1).integers(2, 6, 40)
-    one, other = result("one", falling(presses)), result("other", falling(presses + 2))
-    first, error, success = compare(one, other, np.random.default_rng(0))
+    quick, slow = result("one", falling(presses)), result("other", falling(presses + 2))
+    first, error, success = compare(quick, slow, np.random.default_rng(0))
     assert first.figure == "presses_to_median" and first.difference == ScoreEstimate(-2.0, -2.0, -2.0)
     assert error.difference == success.difference == ScoreEstimate(0.0, 0.0, 0.0)
     assert "difference -2.0 (-2.0 to -2.0); ratio 0." in describe(first, "one", "other")
@@ -81,8 +81,8 @@ def test_a_line_that_is_never_reached():
 
 def test_episodes_without_lesions_do_not_count_for_presses():
     errors = falling(np.repeat([2, 9], 20))
-    one = result("one", errors, lesion_counts=[1] * 20 + [0] * 20)
-    first, *_ = compare(one, one, np.random.default_rng(0))
+    method = result("one", errors, lesion_counts=[1] * 20 + [0] * 20)
+    first, *_ = compare(method, method, np.random.default_rng(0))
     assert first.first == 2.0
 
 

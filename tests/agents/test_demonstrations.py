@@ -117,7 +117,7 @@ def test_a_recording_that_is_interrupted_is_written(folder, monkeypatch, capsys)
     record_demonstrations.main(["SurgSim/Palpate-v0", "--episodes", "5", "--keep-failures", "--dataset", name])
     assert "stopped after 2 of 5 episodes" in capsys.readouterr().out
     written = minari.load_dataset(name)
-    assert [one["seed"] for one in written.storage.get_episode_metadata([0, 1])] == [0, 1]
+    assert [episode["seed"] for episode in written.storage.get_episode_metadata([0, 1])] == [0, 1]
     assert written.total_episodes == 2 and written.total_steps == 8
 
 
@@ -156,7 +156,7 @@ def test_dictionaries_of_observations_come_back_to_the_bit(folder):
         assert len(seen) == 4 and set(episode.observations) == {"picture", "force"}
         for name, stored in episode.observations.items():
             assert stored.dtype == seen[0][name].dtype
-            np.testing.assert_array_equal(stored, [one[name] for one in seen])
+            np.testing.assert_array_equal(stored, [observation[name] for observation in seen])
     with pytest.raises(ValueError, match=r'observations are Dict\(.*record with obs_mode="state"'):
         main(["surgsim/retract/pictures-v0"])
 
@@ -194,18 +194,18 @@ class Wanderer:
 
 
 class Seer(Idle):
-    """Is told where the lesion is, and presses where its random numbers say."""
+    """Sees the lesion, and presses by its random numbers."""
 
     sees_truth = True
 
     def reset(self, rng, facts):
-        self.rng, self.told = rng, (facts.env_id, facts.env_kwargs)
+        self.rng, self.received = rng, (facts.env_id, facts.env_kwargs)
 
     def see(self, task):
         self.task = task
 
     def act(self, observation):
-        assert self.told == ("SurgSim/Palpate-v0", {"scene": "phantom_small", "max_episode_steps": 15})
+        assert self.received == ("SurgSim/Palpate-v0", {"scene": "phantom_small", "max_episode_steps": 15})
         assert self.task.drawn
         return np.array([*self.rng.uniform(-0.5, 0.5, 2), -1.0, -1.0], dtype=np.float32)
 
@@ -227,7 +227,7 @@ def test_a_recorded_episode_of_presses_is_the_one_that_is_scored():
     arguments = {"scene": "phantom_small", "level": "standard", "budget": 4}
     env = gym.make("SurgSim/PalpateSites-v0", **arguments)
     episodes = list(record(env, player(f"{__name__}:Wanderer", env, arguments), (3, 4), keep_failures=True))
-    errors = [[info["error_mm"] for info in one.infos[1:]] for one in episodes]
+    errors = [[info["error_mm"] for info in episode.infos[1:]] for episode in episodes]
     # A result has two decimals, and lanes of float32 round.
     np.testing.assert_allclose(errors, result.errors_mm, atol=0.01)
 
@@ -244,9 +244,9 @@ def test_a_recorded_episode_of_control_steps_is_the_one_that_is_scored_to_the_bi
     scored = play_tasks(actor, make_envs(env_id, 2, dtype="float64", **short), (3, 4))
     env = gym.make(env_id, **short)
     episodes = list(record(env, player(f"{__name__}:Seer", env, short), (3, 4), keep_failures=True))
-    for one, other in zip(episodes, scored, strict=True):
-        assert [info["force_peak"] for info in one.infos[1:]] == other.force_peaks
-        assert max(other.force_peaks) > 0.0 and sum(one.rewards) == other.total
+    for episode, score in zip(episodes, scored, strict=True):
+        assert [info["force_peak"] for info in episode.infos[1:]] == score.force_peaks
+        assert max(score.force_peaks) > 0.0 and sum(episode.rewards) == score.total
     assert episodes[0].actions[0].tolist() != episodes[1].actions[0].tolist()
 
 

@@ -41,7 +41,7 @@ def test_an_agent_cannot_redraw_the_hidden_lesions():
         assert draw(env.task.anatomy, np.random.default_rng(seed)) == drawn  # type: ignore[attr-defined]
         rng = agent_generator(seed)
         again = [draw(env.task.anatomy, rng) for _ in range(20)]  # type: ignore[attr-defined]
-        assert drawn not in again and all(one.background != drawn.background for one in again)
+        assert drawn not in again and all(episode.background != drawn.background for episode in again)
 
 
 def test_its_stream_is_none_of_the_environments_or_their_children():
@@ -89,10 +89,10 @@ def test_lanes_without_a_seed_are_not_stepped(monkeypatch: pytest.MonkeyPatch):
     records = play_sites(AgentActor(Counting), envs, seeds)
     assert len(Counting.acted) == 3 * 2 and sorted(stepped) == [0, 0, 0, 0, 1, 1]
     alone = play_sites(AgentActor(RandomSites), make_envs(SITES, 1, dtype="float64", **SMALL), seeds)
-    for one, other in zip(records, alone, strict=True):
-        np.testing.assert_array_equal(one.truth, other.truth)
-        np.testing.assert_array_equal(one.force, other.force)
-        np.testing.assert_array_equal(press_errors(one, 2), press_errors(other, 2))
+    for record, expected in zip(records, alone, strict=True):
+        np.testing.assert_array_equal(record.truth, expected.truth)
+        np.testing.assert_array_equal(record.force, expected.force)
+        np.testing.assert_array_equal(press_errors(record, 2), press_errors(expected, 2))
 
 
 def test_more_lanes_than_seeds():
@@ -183,15 +183,15 @@ def test_an_episode_that_ends_in_harm_is_no_success():
 
 
 class Still:
-    """Does nothing, and keeps what it was told."""
+    """Does nothing, and keeps its random numbers and facts."""
 
-    told: ClassVar[list[tuple[np.random.Generator, EpisodeFacts]]] = []
+    received: ClassVar[list[tuple[np.random.Generator, EpisodeFacts]]] = []
 
     def reset(self, rng: np.random.Generator, facts: EpisodeFacts) -> None:
-        self.told.append((rng, facts))
+        self.received.append((rng, facts))
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        return np.zeros(self.told[-1][1].action_size, dtype=np.float32)
+        return np.zeros(self.received[-1][1].action_size, dtype=np.float32)
 
 
 class Looking:
@@ -224,10 +224,10 @@ def test_each_agent_is_shown_its_own_part_of_dictionaries():
         rng = agent_generator(seed)
         seen = [single.reset(seed=seed)[0]]
         seen.append(single.step(rng.uniform(-1.0, 1.0, single.action_space.shape).astype(np.float32))[0])
-        for one, other in zip(shown, seen, strict=True):
-            assert set(one) == {"picture", "force"}
-            for name, part in one.items():
-                np.testing.assert_array_equal(part, other[name])
+        for observation, expected in zip(shown, seen, strict=True):
+            assert set(observation) == {"picture", "force"}
+            for name, part in observation.items():
+                np.testing.assert_array_equal(part, expected[name])
 
 
 def test_an_agent_plays_an_environment_of_control_steps():
@@ -235,7 +235,7 @@ def test_an_agent_plays_an_environment_of_control_steps():
     envs = make_envs(env_id, 1, max_episode_steps=3, **kwargs)
     records = play_tasks(AgentActor(Still, lambda env: episode_facts(env, env_id, kwargs)), envs, [8, 9])
     assert [record.steps for record in records] == [3, 3]
-    (first, facts), (second, _) = Still.told
+    (first, facts), (second, _) = Still.received
     assert facts.env_kwargs == kwargs and facts.step_count == EPISODE_STEPS
     assert facts.observation_slices["contact_force"].stop <= envs.single_observation_space.shape[0]  # type: ignore[index]
     assert 0.0 < facts.soft_force < facts.hard_force and facts.control_step == 0.05

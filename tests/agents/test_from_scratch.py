@@ -66,12 +66,12 @@ def test_a_near_declaration_is_paid_as_a_right_one(near: float, paid_as_right: b
     envs = environments({"failure": 0.5, "near": near})
     bare = environments(None)
     rewards, ends = [], []
-    for one in (envs, bare):
-        one.seed(4)
-        one.reset()
+    for vector in (envs, bare):
+        vector.seed(4)
+        vector.reset()
         # Down into the tissue, and the lesion declared at once: on 30 mm no place is 50 mm away.
         act = np.tile(np.array([0.0, 0.0, -0.5, 1.0], dtype=np.float32), (3, 1))
-        seen = [one.step(act) for _ in range(20)]
+        seen = [vector.step(act) for _ in range(20)]
         rewards.append(np.array([reward for _, reward, _, _ in seen]))
         ends.append([(done, infos) for _, _, done, infos in seen])
     wrong = 0
@@ -97,14 +97,14 @@ class Counting:
         from gymnasium.spaces import Box
 
         self.observation_space, self.action_space = Box(-100, 100, (2,)), Box(-1, 1, (1,))
-        self.count, self.told, self.render_mode = np.zeros(2), [], None
+        self.count, self.received, self.render_mode = np.zeros(2), [], None
         self.reset_infos = [{}, {}]
 
     def reset(self):
         return np.stack([self.count, self.count], axis=1)
 
     def step(self, actions):
-        self.told.append(actions[:, 0].tolist())
+        self.received.append(actions[:, 0].tolist())
         self.count += 1
         done = self.count >= [3, 99]
         infos = [{"terminal_observation": np.full(2, self.count[0])} if done[0] else {}, {}]
@@ -123,7 +123,7 @@ def test_a_repeated_action_sums_rewards_and_does_nothing_after_an_end():
     envs.reset()
     observation, reward, done, infos = envs.step(np.ones((2, 1)))
     assert reward.tolist() == [1 + 2 + 3, 1 + 2 + 3 + 4] and done.tolist() == [True, False]
-    assert envs.venv.told == [[1, 1]] * 3 + [[0, 1]]
+    assert envs.venv.received == [[1, 1]] * 3 + [[0, 1]]
     assert infos[0]["terminal_observation"].tolist() == [3, 3] and observation[:, 0].tolist() == [1, 4]
     _, reward, done, _ = envs.step(np.ones((2, 1)))
     assert reward.tolist() == [1 + 2 + 3, 5 + 6 + 7 + 8], "the zeros' reward counts for the episode that they began"

@@ -54,23 +54,23 @@ def test_play_presses_what_the_policy_chooses():
     acquisition, env = Acquisition(tuple(value + 0.1 for value in Acquisition().values)), SiteSurrogate(FACES)
     (errors,) = play(acquisition, [7], FACES)
     observation, _ = env.reset(seed=7)
-    said, over = [], False
+    errors_mm, over = [], False
     while not over:
         observation, _, over, _, info = env.step(acquisition.actions(observation[None])[0])
-        said.append(info["error_mm"])
-    assert len(errors) == min(len(said), PRESSES_MOST)
-    np.testing.assert_allclose(errors, said[:PRESSES_MOST], atol=1e-9)
+        errors_mm.append(info["error_mm"])
+    assert len(errors) == min(len(errors_mm), PRESSES_MOST)
+    np.testing.assert_allclose(errors, errors_mm[:PRESSES_MOST], atol=1e-9)
 
 
 def test_processes_play_the_same_episodes():
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         shared = played(Acquisition(), range(3), FACES, pool=pool, shares=2)
-    for one, alone in zip(shared, play(Acquisition(), range(3), FACES), strict=True):
-        np.testing.assert_array_equal(one, alone)
+    for episode, alone in zip(shared, play(Acquisition(), range(3), FACES), strict=True):
+        np.testing.assert_array_equal(episode, alone)
 
 
 def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
-    assert [presses_to_stay(np.array(one), 5.0) for one in ([4.0, 3.0], [9.0, 4.0], [4.0, 9.0])] == [1, 2, 3]
+    assert [presses_to_stay(np.array(episode), 5.0) for episode in ([4.0, 3.0], [9.0, 4.0], [4.0, 9.0])] == [1, 2, 3]
     early, late = (np.where(np.arange(25) < found, 20.0, 1.0) for found in (5, 15))
     # Means 4.8 and 12.4 mm over 20 mm; 6 and 16 of 25 presses; above 5 mm after 0 and 8 of the presses 8 to 20, where
     # errors of 1 and 20 mm count as 1 / (1 + e^4) and 1.

@@ -133,8 +133,8 @@ def test_lerobot_plays_what_its_hub_gives(monkeypatch):
 
     # Other tests import the file as a plugin, in this process.
     monkeypatch.setattr(EnvConfig, "_choice_registry", {})
-    found = ("surgsim/envs", "env.py", str(ENV_FILE), None)
-    monkeypatch.setattr(factory, "_download_hub_file", lambda *given: found)
+    hub_file = ("surgsim/envs", "env.py", str(ENV_FILE), None)
+    monkeypatch.setattr(factory, "_download_hub_file", lambda *given: hub_file)
     envs = factory.make_env("surgsim/envs", n_envs=2, trust_remote_code=True)
     assert list(envs) == ["SurgSim/Palpate-v0", "SurgSim/Retract-v0", "SurgSim/BimanualRetract-v0"]
     policy, same = Idle(), lambda value: value

@@ -41,8 +41,8 @@ def features(observations):
 
     from surgsim_apps.training.face_features import face_features
 
-    found = face_features(torch.as_tensor(observations))
-    return {one.name: getattr(found, one.name).numpy()[0] for one in fields(found)}
+    values = face_features(torch.as_tensor(observations))
+    return {field.name: getattr(values, field.name).numpy()[0] for field in fields(values)}
 
 
 def actions(observations):
@@ -197,7 +197,7 @@ def test_the_surrogate_presses_as_the_organ_does():
     formula = made.step(np.zeros((1, 4)))[0]
     assert formula[FACE["tip_depth"]] == pytest.approx(organ["tip_depth"], abs=1e-4)
     np.testing.assert_allclose(formula[FACE["surface_normal"]], organ["surface_normal"], atol=1e-4)
-    along = [one @ organ["surface_normal"] for one in (formula[FACE["face_force"]], organ["face_force"])]
+    along = [force @ organ["surface_normal"] for force in (formula[FACE["face_force"]], organ["face_force"])]
     assert along[0] == pytest.approx(along[1], rel=0.4) and along[1] > 0.1
 
 

@@ -70,7 +70,7 @@ def test_sampled_actions_of_an_episode_do_not_depend_on_those_beside_it():
         policy.reset(count)
         for index in range(count):
             policy.begin(index, None, agent_generator(episode if index == at else 100 + index))
-        return [policy.act(np.repeat(one[None], count, axis=0))[at].tobytes() for one in observations]
+        return [policy.act(np.repeat(observation[None], count, axis=0))[at].tobytes() for observation in observations]
 
     assert played(1, 0, 7) == played(3, 2, 7) != played(3, 2, 8)
 
@@ -92,7 +92,7 @@ def test_the_actor_of_stable_baselines3_acts_as_its_model(drawn: bool):
     model = stable_baselines3.PPO("MlpPolicy", gym.make(ENV_ID), n_steps=8, batch_size=8, seed=0, device="cpu")
     made = actor_of(model.policy, NetworkLayout("tanh"), drawn=drawn)
     wanted, _ = model.predict(seen(3), deterministic=True)
-    acted = [made.actions(seen(3), [torch.Generator().manual_seed(n + one) for n in range(3)]) for one in range(200)]
+    acted = [made.actions(seen(3), [torch.Generator().manual_seed(n + draw) for n in range(3)]) for draw in range(200)]
     # Means of 200 draws of a unit normal, cut to [-1, 1], are off by 4 x 0.72 / 14 at most.
     np.testing.assert_allclose(np.mean(acted, axis=0), wanted, atol=0.21 if drawn else 1e-6)
     assert (np.std(acted, axis=0) > 0.6).all() == drawn

@@ -54,12 +54,12 @@ def test_pressing_everywhere_finds_lesions_and_pays_them_once():
     face = next(face for face in recorded.faces if len(face.truth) == 1)
     env = SiteSurrogate(lambda rng: face)
     env.reset(seed=7)
-    found, total, over, rng = env.found, 0.0, False, np.random.default_rng(0)
+    share, total, over, rng = env.found_share, 0.0, False, np.random.default_rng(0)
     sites = face.map.places[face.map.pressable]
     while not over:
         _, reward, over, _, info = env.step(sites[rng.integers(len(sites))].astype(np.float32))
         total += reward
-    gained = reward_weights(PalpateSitesTask)["found"] * (env.found - found)
+    gained = reward_weights(PalpateSitesTask)["found"] * (env.found_share - share)
     assert gained + reward_weights(PalpateSitesTask)["error"] <= total <= gained and info["error_mm"] >= 0.0
 
 

@@ -66,7 +66,7 @@ def test_forces_are_those_entries_of_the_observation():
     env = gym.make(ID, scaled=False)
     observation, _ = env.reset(seed=3)
     assert env.unwrapped.layout.force_entries == list(range(13, 21))
-    np.testing.assert_array_equal(observation[13:16], env.unwrapped.layout.sensed_force(observation).astype(np.float32))
+    assert env.unwrapped.observation_slices["contact_force"] == slice(13, 16)
     assert observation[19] == observation[20] == 0.0 and observation[21] == 0.0
 
 

@@ -70,9 +70,9 @@ def test_every_agent_finds_one_lesion(name: str) -> None:
     # A raster that is not done has left out a part of the chart.
     played(name, chart, presses=max(25, int(name[-1]) ** 2 if name.startswith("raster") else 0))
     estimator = LesionEstimator(FACTS.extent, lesion_radius=FACTS.lesion_radius, noise=FACTS.noise)
-    said = estimator.estimate(np.array(chart.places), np.array(chart.values)).points
-    assert said.shape == (1, 2)
-    assert np.linalg.norm(said[0] - chart.centres[0]) < 0.003
+    estimate = estimator.estimate(np.array(chart.places), np.array(chart.values)).points
+    assert estimate.shape == (1, 2)
+    assert np.linalg.norm(estimate[0] - chart.centres[0]) < 0.003
 
 
 def test_a_raster_presses_the_middles_of_its_fields() -> None:

@@ -36,19 +36,19 @@ def test_equal_shares_go_by_clearance_then_force_then_order():
     weak = case("weak", both=0.5, clearance=0.010, force=2.5)
     twin = case("twin", both=0.5, clearance=0.010, force=2.5)
     ranked = rank([near, weak, twin, strong])
-    assert [one.name for one in ranked] == ["strong", "weak", "twin", "near"]
+    assert [row.name for row in ranked] == ["strong", "weak", "twin", "near"]
 
 
 def test_differences_below_the_rounding_do_not_rank():
     """Half a millimetre of rounding cannot outrank a newton: 10.2 and 9.8 mm are both 10."""
     ranked = rank([case("a", both=0.5, clearance=0.0102, force=1.0), case("b", both=0.5, clearance=0.0098, force=2.0)])
-    assert [one.name for one in ranked] == ["b", "a"]
+    assert [row.name for row in ranked] == ["b", "a"]
 
 
 def test_one_that_reaches_nothing_is_last():
     nothing = case("nothing", both=0.0, left=0.0, right=0.0)
     ranked = rank([nothing, case("little", both=0.0, left=0.02, right=0.0)])
-    assert [one.name for one in ranked] == ["little", "nothing"]
+    assert [row.name for row in ranked] == ["little", "nothing"]
     assert np.isnan(ranked[1].clearance)
 
 
@@ -60,19 +60,19 @@ def test_figures_of_the_rows_are_the_arrays():
 
 def test_both_arms_count_before_either():
     pair, single = case("pair", both=0.4, left=0.5, right=0.5), case("single", both=0.3, left=0.9)
-    assert [one.name for one in rank([single, pair])] == ["pair", "single"]
+    assert [row.name for row in rank([single, pair])] == ["pair", "single"]
 
 
 def test_the_median_is_over_both_arms_and_the_nearer_of_organ_and_wall():
-    one = made_evaluation(inner_count=5)
+    evaluation = made_evaluation(inner_count=5)
     wanted = [
         min(arm.organ_clearance[index], arm.wall_clearance[index])
-        for arm in (one.left, one.right)
+        for arm in (evaluation.left, evaluation.right)
         for index in np.flatnonzero(arm.reachable)
     ]
-    (row,) = rank([("one", "made", one)])
+    (row,) = rank([("one", "made", evaluation)])
     assert row.clearance == np.median(wanted)
-    assert row.both == one.both[:-5].mean()
+    assert row.both == evaluation.both[:-5].mean()
 
 
 def test_either_arm_decides_where_both_are_alike():
@@ -82,7 +82,9 @@ def test_either_arm_decides_where_both_are_alike():
 
 
 def test_a_patient_who_breathes_is_reached_at_every_position():
-    one = made_evaluation()
-    one = replace(one, cycle=made_cycle(one))
-    (row,) = rank([("one", "made", one)])
-    assert row.both == one.cycle.both_always[~one.inner].mean() < one.both[~one.inner].mean()
+    evaluation = made_evaluation()
+    evaluation = replace(evaluation, cycle=made_cycle(evaluation))
+    (row,) = rank([("one", "made", evaluation)])
+    assert (
+        row.both == evaluation.cycle.both_always[~evaluation.inner].mean() < evaluation.both[~evaluation.inner].mean()
+    )

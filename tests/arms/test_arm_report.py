@@ -82,12 +82,12 @@ def page(folder):
 
 
 def test_the_verdict_says_what_the_arrays_say(evaluation):
-    said = verdict(evaluation)
+    sentence = verdict(evaluation)
     left, right, outer = evaluation.left, evaluation.right, ~evaluation.inner
     shares = [f"{100 * mask[outer].mean():.0f} %" for mask in (left.reachable, right.reachable, evaluation.both)]
-    assert f"the left arm reaches {shares[0]}, the right arm {shares[1]}, and both at once {shares[2]}." in said
-    assert "Of 110 points on the surface of ellipsoid that face the ports" in said
-    assert f"Of 10 targets inside it both at once reach {evaluation.both[evaluation.inner].sum()}." in said
+    assert f"the left arm reaches {shares[0]}, the right arm {shares[1]}, and both at once {shares[2]}." in sentence
+    assert "Of 110 points on the surface of ellipsoid that face the ports" in sentence
+    assert f"Of 10 targets inside it both at once reach {evaluation.both[evaluation.inner].sum()}." in sentence
 
 
 def test_tables_show_least_median_and_greatest(evaluation, page):
@@ -121,11 +121,11 @@ def test_tables_show_shares_and_reasons(evaluation, page):
 
 def test_the_worse_of_both_is_the_less_useful(evaluation):
     for field, pick in (("tip_force", np.minimum), ("trocar_load", np.maximum)):
-        quantity = next(one for one in QUANTITIES if one.field == field)
+        quantity = next(item for item in QUANTITIES if item.field == field)
         wanted = pick(getattr(evaluation.left, field), getattr(evaluation.right, field))[evaluation.both]
-        found = quantity.worse_of_both(evaluation)
-        np.testing.assert_array_equal(found[evaluation.both], wanted)
-        assert np.isnan(found[~evaluation.both]).all()
+        worse = quantity.worse_of_both(evaluation)
+        np.testing.assert_array_equal(worse[evaluation.both], wanted)
+        assert np.isnan(worse[~evaluation.both]).all()
 
 
 def test_points_come_back_from_the_table(evaluation, folder):

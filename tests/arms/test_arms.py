@@ -53,7 +53,7 @@ def phantom():
 
 
 @pytest.fixture(scope="module")
-def found(phantom):
+def evaluation(phantom):
     return evaluate_both_arms(phantom)
 
 
@@ -67,21 +67,21 @@ def arm_figures(arm: ArmReach):
     return {name: getattr(arm, name) for name in vars(arm) if name not in ("name", "joints")}
 
 
-def test_shapes_and_targets(found, phantom):
-    assert found.points.shape == found.normals.shape == (27, 3)
-    assert found.inner.tolist() == [False] * 25 + [True] * 2
-    for arm in (found.left, found.right):
+def test_shapes_and_targets(evaluation, phantom):
+    assert evaluation.points.shape == evaluation.normals.shape == (27, 3)
+    assert evaluation.inner.tolist() == [False] * 25 + [True] * 2
+    for arm in (evaluation.left, evaluation.right):
         for name, values in arm_figures(arm).items():
             assert values.shape == (27,), name
         assert arm.joints.shape == (27, 6)
-    assert [REASONS[index] for index in found.left.reason[25:]] == ["reachable", "a joint limit"]
-    assert found.both[25:].tolist() == [True, False]
-    assert found.scene == "phantom" and found.surface_points is phantom.mesh.points
+    assert [REASONS[index] for index in evaluation.left.reason[25:]] == ["reachable", "a joint limit"]
+    assert evaluation.both[25:].tolist() == [True, False]
+    assert evaluation.scene == "phantom" and evaluation.surface_points is phantom.mesh.points
 
 
-def test_what_is_reported_is_so(found):
+def test_what_is_reported_is_so(evaluation):
     """Where a point is reached everything is known, the tip is there and both arms keep 5 mm apart."""
-    for arm in (found.left, found.right):
+    for arm in (evaluation.left, evaluation.right):
         good = arm.reachable
         assert good[:25].all() and not good[26]
         for name, values in arm_figures(arm).items():
@@ -91,22 +91,25 @@ def test_what_is_reported_is_so(found):
         assert (arm.organ_clearance[:25] >= 0.0).all() and (arm.wall_clearance[good] >= 0.0).all()
         assert ((arm.isotropy[good] > 0.0) & (arm.isotropy[good] <= 1.0)).all()
         assert ((arm.limit_margin[good] > 0.0) & (arm.limit_margin[good] <= 1.0)).all()
-    both = found.both
-    assert both.any() and (np.minimum(found.arm_distance_inside, found.arm_distance_outside)[both] >= 0.005).all()
+    both = evaluation.both
+    assert (
+        both.any()
+        and (np.minimum(evaluation.arm_distance_inside, evaluation.arm_distance_outside)[both] >= 0.005).all()
+    )
 
 
-def test_mujoco_agrees_with_what_is_reported(found, phantom):
+def test_mujoco_agrees_with_what_is_reported(evaluation, phantom):
     """MuJoCo's own kinematics at the reported joints: the tip at its place, limits and trocar kept.
 
     Points p of the axes outside the tip's zone are |max(|p - c| - h, 0)| from the block of half sizes h, less radii.
     """
     ports, radius = default_ports(phantom), phantom.scene.instrument.tip_radius
-    for report, place, ball in ((found.left, ports.left, radius), (found.right, ports.right, 0.0)):
+    for report, place, ball in ((evaluation.left, ports.left, radius), (evaluation.right, ports.right, 0.0)):
         arm = load_arm(report.name, place.port, tip_radius=radius)
         for row in range(25):
             joints = report.joints[row]
             tip = arm.tip_pose(joints).position
-            assert np.linalg.norm(tip - found.points[row] - ball * found.normals[row]) < 1e-3
+            assert np.linalg.norm(tip - evaluation.points[row] - ball * evaluation.normals[row]) < 1e-3
             assert (joints >= arm.lower).all() and (joints <= arm.upper).all()
             assert arm.trocar_residual(joints) < 1e-9
             ends = arm.shape_ends(joints)
@@ -119,14 +122,14 @@ def test_mujoco_agrees_with_what_is_reported(found, phantom):
 
 
 @pytest.mark.slow
-def test_run_repeats_to_the_byte(found, phantom):
+def test_run_repeats_to_the_byte(evaluation, phantom):
     """Same arguments, same bytes, of every array; another seed, other points."""
     again = evaluate_both_arms(phantom)
-    for arm, other in ((found.left, again.left), (found.right, again.right)):
+    for arm, other in ((evaluation.left, again.left), (evaluation.right, again.right)):
         for name in vars(arm):
             if name != "name":
                 assert getattr(arm, name).tobytes() == getattr(other, name).tobytes(), name
-    assert found.arm_distance_inside.tobytes() == again.arm_distance_inside.tobytes()
+    assert evaluation.arm_distance_inside.tobytes() == again.arm_distance_inside.tobytes()
     first = facing_points(phantom, np.array([[0.03, 0.03, 0.2]]), 5, 0)[0]
     assert not np.array_equal(first, facing_points(phantom, np.array([[0.03, 0.03, 0.2]]), 5, 1)[0])
 
@@ -285,7 +288,7 @@ def test_no_point_faces_ports_below_the_tray(phantom):
         facing_points(phantom, np.array([[0.03, 0.03, -0.2]]), 10, 0)
 
 
-def test_ports_too_far_off_reach_nothing(phantom, found):
+def test_ports_too_far_off_reach_nothing(phantom, evaluation):
     """From 30 cm above nothing is reached."""
     up = table(
         left={"point": [-0.05, 0.03, 0.33], "target": [0.03, 0.03, 0.03]},
@@ -293,7 +296,7 @@ def test_ports_too_far_off_reach_nothing(phantom, found):
     )
     far = evaluate_arms(phantom, "psm_palpator", "psm_grasper", ports_from_table(up, name="far"), count=5)
     assert not (far.left.reachable | far.right.reachable).any()
-    assert found.both.mean() > 0.5
+    assert evaluation.both.mean() > 0.5
 
 
 def test_pictures_show_the_fine_surface(phantom, tmp_path):
@@ -312,5 +315,5 @@ def test_pictures_show_the_fine_surface(phantom, tmp_path):
 @pytest.mark.parametrize("scene", ["phantom", "liver"])
 def test_five_hundred_points(scene):
     """Two da Vinci-like arms at their default ports reach most of what faces them."""
-    found = evaluate_arms(scene, "psm_palpator", "psm_palpator", count=500)
-    assert found.both.mean() > 0.9
+    evaluation = evaluate_arms(scene, "psm_palpator", "psm_palpator", count=500)
+    assert evaluation.both.mean() > 0.9

@@ -62,9 +62,9 @@ def test_the_files(folder, made, capsys):
     assert main(arguments("--seed", "3", left="mine.toml")) == 0
     names = {path.name for path in (folder / "out").iterdir()}
     assert {"report.html", "points.csv", "map_reach.png", "map_tip_force.png", "arms.png"} <= names
-    said = " ".join(capsys.readouterr().out.split())
-    assert "the left arm reaches" in said and "written: out/{report.html" in said
-    assert "drawing the maps ..." in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "the left arm reaches" in output and "written: out/{report.html" in output
+    assert "drawing the maps ..." in output
     assert made[0][2].endoscope.point == (0.03, -0.02, 0.15)
 
 

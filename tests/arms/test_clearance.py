@@ -69,8 +69,8 @@ TRIANGLE = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
 )
 def test_segment_and_triangle_closed_forms(segment, distance):
     for corners in (TRIANGLE, TRIANGLE[::-1]):
-        found = segment_triangle_distance(np.array([segment], dtype=float), corners[None])
-        assert found[0] == pytest.approx(distance, abs=1e-14)
+        measured = segment_triangle_distance(np.array([segment], dtype=float), corners[None])
+        assert measured[0] == pytest.approx(distance, abs=1e-14)
 
 
 @settings(max_examples=60, deadline=None)
@@ -106,7 +106,7 @@ def test_surface_clusters_lose_no_triangle():
     rng = np.random.default_rng(1)
     segments = rng.uniform(-0.12, 0.12, (60, 2, 3))
     corners = points[triangles]
-    brute = [segment_triangle_distance(np.broadcast_to(one, (len(corners), 2, 3)), corners).min() for one in segments]
+    brute = [segment_triangle_distance(np.broadcast_to(pair, (len(corners), 2, 3)), corners).min() for pair in segments]
     assert surface.distance(segments) == pytest.approx(brute, abs=1e-15)
     assert (np.array(brute) == 0.0).any() and (np.array(brute) > 0.02).any()
     assert surface.distance(segments, 0.01) == pytest.approx(np.minimum(brute, 0.01), abs=1e-15)
@@ -118,8 +118,8 @@ def test_capsule_over_a_sphere():
 
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     surface = ClusteredSurface(np.asarray(sphere.vertices), np.asarray(sphere.faces))
-    found = surface.distance(np.array([[[-0.1, 0.0, 0.07], [0.1, 0.0, 0.07]]]))[0]
-    assert found == pytest.approx(0.02, abs=0.05 * (0.04 / 2) ** 2 / 2 * 4)
+    measured = surface.distance(np.array([[[-0.1, 0.0, 0.07], [0.1, 0.0, 0.07]]]))[0]
+    assert measured == pytest.approx(0.02, abs=0.05 * (0.04 / 2) ** 2 / 2 * 4)
 
 
 def test_outside_ball_keeps_what_is_outside():

@@ -94,9 +94,9 @@ def test_directions_mirror():
     normals = rng.normal(size=(5, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     towards, line = rng.normal(size=(5, 3)), np.array([1.0, 0.0, 0.0])
-    one = approach_directions(normals, towards, line) * mirror
-    other = approach_directions(normals * mirror, towards * mirror, line)
-    for mine, theirs in zip(one, other, strict=True):
+    mirrored = approach_directions(normals, towards, line) * mirror
+    direct = approach_directions(normals * mirror, towards * mirror, line)
+    for mine, theirs in zip(mirrored, direct, strict=True):
         gaps = np.linalg.norm(mine[:, None] - theirs, axis=2)
         assert gaps.min(axis=1).max() < 1e-12
 
@@ -113,13 +113,13 @@ def test_approach_share_counts_usable_tips():
     directions = approach_directions(
         np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]), np.array([1.0, 0.0, 0.0])
     )
-    every, one = np.ones((1, 5), dtype=bool), np.ones((1, 1), dtype=bool)
+    usable, single = np.ones((1, 5), dtype=bool), np.ones((1, 1), dtype=bool)
     pointing = -directions[:, :5]
-    assert directions_met(pointing, every, directions).sum() == 5
-    assert not directions_met(pointing, ~every, directions).any()
+    assert directions_met(pointing, usable, directions).sum() == 5
+    assert not directions_met(pointing, ~usable, directions).any()
     turned = -directions[:, :1] + [[[0.0, math.tan(math.radians(9.9)), 0.0]]]
     turned /= np.linalg.norm(turned, axis=2)[..., None]
-    assert directions_met(turned, one, directions).sum() == 1
+    assert directions_met(turned, single, directions).sum() == 1
     turned = -directions[:, :1] + [[[0.0, math.tan(math.radians(10.1)), 0.0]]]
     turned /= np.linalg.norm(turned, axis=2)[..., None]
-    assert not directions_met(turned, one, directions).any()
+    assert not directions_met(turned, single, directions).any()

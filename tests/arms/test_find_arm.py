@@ -95,15 +95,15 @@ def bare_six_axis(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_faulty_urdf_becomes_an_arm_with_its_remote_centre(scope):
-    found = find_arm(scope)
-    arm = load_arm(found.description)
-    assert found.description.joints == ("yaw", "pitch", "insertion", "roll", "bend")
-    assert found.description.trocar.fixed
-    np.testing.assert_allclose(found.description.trocar.point, CENTRE, atol=1e-9)
+    arm_model = find_arm(scope)
+    arm = load_arm(arm_model.description)
+    assert arm_model.description.joints == ("yaw", "pitch", "insertion", "roll", "bend")
+    assert arm_model.description.trocar.fixed
+    np.testing.assert_allclose(arm_model.description.trocar.point, CENTRE, atol=1e-9)
     # The tip is 10 cm past the centre along the shaft, the wrist straight.
     np.testing.assert_allclose(arm.tip_pose(arm.home).position, [0.0, 0.0, -0.1], atol=1e-8)
     np.testing.assert_allclose(arm.tip_direction(arm.home), [0.0, 0.0, -1.0], atol=1e-8)
-    assert found.reach == 1.0
+    assert arm_model.reach == 1.0
 
 
 def test_its_tip_follows_the_closed_form(scope):
@@ -117,9 +117,9 @@ def test_its_tip_follows_the_closed_form(scope):
 
 
 def test_meshes_of_a_package_are_found_and_drawn(scope):
-    found = find_arm(scope)
-    model = load_arm(found.description).model
-    assert not found.description.dropped_meshes
+    arm_model = find_arm(scope)
+    model = load_arm(arm_model.description).model
+    assert not arm_model.description.dropped_meshes
     assert model.nmesh == 3
     # MuJoCo turns a mesh into its principal axes.
     sizes = np.array([np.sort(np.ptp(vertices(model, mesh), axis=0)) for mesh in range(3)])
@@ -144,30 +144,30 @@ def test_a_mesh_is_found_where_folders_differ(tmp_path, name, place):
     (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / place).write_text("solid")
     (tmp_path / "scope/urdf").mkdir(parents=True, exist_ok=True)
-    found = find_mesh(tmp_path / "scope/urdf/arm.urdf", name, "parts")
-    assert found is not None
-    assert found.samefile(tmp_path / place)
+    mesh = find_mesh(tmp_path / "scope/urdf/arm.urdf", name, "parts")
+    assert mesh is not None
+    assert mesh.samefile(tmp_path / place)
 
 
 def test_missing_meshes_are_named_and_left_out(scope):
     (scope.parents[1] / "meshes" / "visual" / "block.stl").unlink()
-    found = find_arm(scope)
-    assert found.description.dropped_meshes == ("package://scope/meshes/visual/block.stl",)
-    assert any("visual/block.stl" in sentence for sentence in found.chosen)
-    assert load_arm(found.description).model.nmesh == 2
+    arm_model = find_arm(scope)
+    assert arm_model.description.dropped_meshes == ("package://scope/meshes/visual/block.stl",)
+    assert any("visual/block.stl" in sentence for sentence in arm_model.chosen)
+    assert load_arm(arm_model.description).model.nmesh == 2
 
 
 def test_missing_inertias_are_those_of_a_block_around_the_shapes(scope):
-    found = find_arm(scope)
-    inertias = {one.link: one for one in found.description.inertias}
+    arm_model = find_arm(scope)
+    inertias = {inertia.link: inertia for inertia in arm_model.description.inertias}
     # m (b^2 + c^2) / 12 about the axis a.
     square = BLOCK**2
     np.testing.assert_allclose(inertias["yawed"].moments, 1.2 / 12.0 * (square.sum() - square), rtol=1e-6)
     assert inertias["yawed"].centre == (0.0, 0.0, 0.1)
     # The wrist's matrix is not positive definite; links without any inertia are moved by joints.
     assert {"wrist", "carriage", "rolled", "pitched"} <= inertias.keys()
-    assert any("yawed" in sentence for sentence in found.chosen)
-    model = load_arm(found.description).model
+    assert any("yawed" in sentence for sentence in arm_model.chosen)
+    model = load_arm(arm_model.description).model
     np.testing.assert_allclose(np.sort(model.body("yawed").inertia), np.sort(inertias["yawed"].moments), rtol=1e-6)
 
 
@@ -190,11 +190,11 @@ def test_what_is_coupled_to_a_driven_joint_is_held_where_it_is_at_home(scope, le
         pitch = '<joint name="pitch" type="revolute">'
         text = text.replace(pitch, f'{pitch}<mimic joint="counter" multiplier="-1"/>')
     scope.write_text(text)
-    found = find_arm(scope).description
-    assert found.home["pitch"] >= 0.2
-    assert found.held["counter"] == pytest.approx(-found.home["pitch"], abs=1e-9)
-    assert set(found.held) == {"counter", "open_1", "open_2"}
-    assert {load_arm(found).model.joint(index).name for index in range(5)} == set(found.joints)
+    description = find_arm(scope).description
+    assert description.home["pitch"] >= 0.2
+    assert description.held["counter"] == pytest.approx(-description.home["pitch"], abs=1e-9)
+    assert set(description.held) == {"counter", "open_1", "open_2"}
+    assert {load_arm(description).model.joint(index).name for index in range(5)} == set(description.joints)
 
 
 def test_its_file_reads_back_equal(scope):
@@ -228,32 +228,32 @@ def test_it_presses_like_the_probe(scope):
 
 
 def test_a_tool_of_the_model_is_used_as_it_is():
-    found = find_arm(SIX_AXIS).description
-    assert found.contact == ("tip_ball", "neck", "shaft")
-    assert found.tip.ball == "tip_ball"
-    assert found.trocar.shaft_body == "wrist_3"
-    np.testing.assert_allclose(np.abs(found.trocar.shaft_axis), [0.0, 1.0, 0.0], atol=1e-9)
-    assert "fore_link" in found.links
+    description = find_arm(SIX_AXIS).description
+    assert description.contact == ("tip_ball", "neck", "shaft")
+    assert description.tip.ball == "tip_ball"
+    assert description.trocar.shaft_body == "wrist_3"
+    np.testing.assert_allclose(np.abs(description.trocar.shaft_axis), [0.0, 1.0, 0.0], atol=1e-9)
+    assert "fore_link" in description.links
 
 
 def test_an_arm_without_a_tool_gets_a_palpator_on_its_last_axis(bare_six_axis):
-    found = find_arm(bare_six_axis)
-    description = found.description
+    arm_model = find_arm(bare_six_axis)
+    description = arm_model.description
     arm = load_arm(description)
     assert description.trocar.shaft_body == "wrist_3"
     # The flange is 75 mm along the last hinge's axis, the tool 400 mm long.
     np.testing.assert_allclose(description.tip.offset, [0.0, 0.475, 0.0], atol=1e-6)
-    assert any("400 mm" in sentence for sentence in found.chosen)
+    assert any("400 mm" in sentence for sentence in arm_model.chosen)
     assert arm.trocar_residual(arm.home) < 1e-5
     near, along = arm.shaft_line(arm.home)
     assert (arm.tip_pose(arm.home).position - near) @ along == pytest.approx(0.1, abs=1e-6)
-    assert found.reach > 0.5
+    assert arm_model.reach > 0.5
 
 
 def test_a_given_trocar_gets_a_home(bare_six_axis):
-    found = find_arm(bare_six_axis, trocar=(0.36, 0.13, 0.12), tool_length=0.3)
-    assert found.description.trocar.point == (0.36, 0.13, 0.12)
-    arm = load_arm(found.description)
+    arm_model = find_arm(bare_six_axis, trocar=(0.36, 0.13, 0.12), tool_length=0.3)
+    assert arm_model.description.trocar.point == (0.36, 0.13, 0.12)
+    arm = load_arm(arm_model.description)
     assert arm.trocar_residual(arm.home) < 1e-5
 
 
@@ -327,14 +327,14 @@ def test_a_held_joint_is_not_driven(scope):
 
 def test_the_command_writes_a_commented_file_and_a_picture(scope, capsys):
     assert main(["arm", "check", str(scope)]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     path = scope.parent / "scope.toml"
     arm = load_arm(path)
     assert arm.home == pytest.approx(load_arm(find_arm(scope).description).home, abs=1e-9)
-    assert "remote centre" in said
-    assert "warning: links without a valid inertia" in said
+    assert "remote centre" in output
+    assert "warning: links without a valid inertia" in output
     begun = ("model", "[trocar", "tolerance", "stiff")
     entries = [line for line in path.read_text().splitlines() if line.startswith(begun)]
     assert len(entries) == 4
     assert all("#" in line for line in entries)
-    assert (scope.parent / "scope.png").exists() or "no picture: " in said
+    assert (scope.parent / "scope.png").exists() or "no picture: " in output

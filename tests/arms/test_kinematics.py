@@ -57,8 +57,8 @@ def test_search_finds_what_is_there(name):
     sine, cosine = np.linalg.norm(np.cross(pointing, there.direction), axis=1), (pointing * there.direction).sum(axis=1)
     angle = np.arctan2(sine, cosine)
     assert ((turned.position_error < 1e-7) & (angle < 1e-3)).mean() > 0.98
-    for found in (placed, turned):
-        assert (found.joints >= arm.lower).all() and (found.joints <= arm.upper).all()
+    for candidates in (placed, turned):
+        assert (candidates.joints >= arm.lower).all() and (candidates.joints <= arm.upper).all()
 
 
 def test_search_keeps_a_trocar_by_control():
@@ -69,6 +69,6 @@ def test_search_keeps_a_trocar_by_control():
     rng = np.random.default_rng(0)
     aside = rng.normal(0.0, 0.25, (100, 3)) + into
     tips = arm.port.point + aside / np.linalg.norm(aside, axis=1)[:, None] * rng.uniform(0.05, 0.18, (100, 1))
-    found = search_joints(kinematics, Wanted(tips), np.tile(arm.home, (100, 1)))
-    assert (found.position_error < 1e-7).all()
-    assert (found.trocar_error < 1e-7).all()
+    candidates = search_joints(kinematics, Wanted(tips), np.tile(arm.home, (100, 1)))
+    assert (candidates.position_error < 1e-7).all()
+    assert (candidates.trocar_error < 1e-7).all()

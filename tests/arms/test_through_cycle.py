@@ -43,10 +43,10 @@ def test_positions_go_from_rest_to_the_top_and_end_with_all_at_the_top():
 def test_without_amplitude_the_numbers_are_those_of_a_still_organ(tmp_path):
     path = write_pivot(tmp_path)
     still = evaluate_arms(moving(()), path, path, count=12)
-    held = [replace(one, size=(0.0, 0.0)) for one in (BREATH, BEAT)]
-    found = evaluate_arms(moving(held), path, path, count=12)
+    held = [replace(motion, size=(0.0, 0.0)) for motion in (BREATH, BEAT)]
+    moved = evaluate_arms(moving(held), path, path, count=12)
     assert still.cycle is None
-    cycle = found.cycle
+    cycle = moved.cycle
     assert cycle is not None and len(cycle.both) == 8
     assert 0 < still.left.reachable.sum()
     for arm, follower in ((still.left, cycle.left), (still.right, cycle.right)):

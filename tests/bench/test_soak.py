@@ -97,9 +97,9 @@ def test_kinds_of_environments_repeat_with_other_actions():
 def test_memory_is_compared_once_kinds_repeat():
     """Runs of one kind with each other: kinds hold different amounts."""
     count, kinds = 3 * soak.KINDS, soak.KINDS
-    memory = {number: 1e9 * (number % kinds) + 1e6 * max(number - kinds, 0) for number in range(0, count, 2)}
-    assert soak.growth(memory, 2) == pytest.approx(1e6 * kinds)
-    assert soak.growth(dict.fromkeys(range(2 * kinds + 4), 1e6), 2) is None
+    memory = [1e9 * (number % kinds) + 1e6 * max(number - kinds, 0) for number in range(count)]
+    assert soak.growth(memory) == pytest.approx(1e6 * kinds)
+    assert soak.growth([1e6] * (2 * kinds + 4)) is None
 
 
 def freed(blocks):

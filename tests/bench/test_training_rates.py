@@ -6,24 +6,24 @@ from surgsim_apps.bench.report import AbsentError
 
 
 def test_rates_are_medians_and_what_cannot_run_says_why(monkeypatch):
-    def step(one, effort):
-        if "pictures" in one.case:
+    def step(figure, effort):
+        if "pictures" in figure.case:
             raise AbsentError("no OpenGL here")
         clock = training.Clock()
         clock.rates = {training.WALL: [100.0, 500.0, 300.0], training.PROCESSOR: [50.0, 60.0, 70.0]}
         return clock
 
-    def learn(one, effort):
+    def learn(figure, effort):
         raise AbsentError("stable-baselines3 cannot be imported")
 
     monkeypatch.setattr(training, "step", step)
     monkeypatch.setattr(training, "learn", learn)
-    figures = {(one.case, one.quantity): one for one in training.measure(QUICK).figures}
+    figures = {(figure.case, figure.quantity): figure for figure in training.measure(QUICK).figures}
     assert figures["Palpate, phantom_small, memory", "stepping, wall"].value == 300.0
     assert figures["Palpate, phantom_small, memory", "stepping, processor"].value == 60.0
     absent = figures["Retract, pictures", "stepping, wall"]
     assert absent.value is None and absent.note == "no OpenGL here"
-    assert sum(one.note == "stable-baselines3 cannot be imported" for one in figures.values()) == 3
+    assert sum(figure.note == "stable-baselines3 cannot be imported" for figure in figures.values()) == 3
 
 
 def test_a_round_ends_where_the_next_begins(monkeypatch):

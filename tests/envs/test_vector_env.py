@@ -1,6 +1,7 @@
 """Environments side by side give what each would give alone: held against gymnasium's SyncVectorEnv, to the bit."""
 
 import sys
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -228,7 +229,8 @@ def test_compiled_code_is_three_calls_below_step(monkeypatch: pytest.MonkeyPatch
 
     def haptic_loop(*, compiled: bool):
         def advance(*arguments):
-            frame, count = sys._getframe(1), 1
+            frame: Any = sys._getframe(1)
+            count = 1
             while frame.f_code is not SurgicalEnv.step.__code__:
                 frame, count = frame.f_back, count + 1
             counts.append(count)

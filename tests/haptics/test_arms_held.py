@@ -33,10 +33,10 @@ def held_arms(scene: str, instrument: str, ways: list, hand: Hand) -> tuple[Hapt
 def test_arm_follows_its_hand_and_feels_what_the_tissue_gives():
     loop, (device,) = held_arms("phantom_small", "psm_palpator", [[0.0, 0.0, -0.0125]], Hand(300.0, 2.0))
     for _ in range(1500):
-        told = loop.step()
+        telemetry = loop.step()
         device.advance()
-    tip = told.tip
-    assert not told.fault
+    tip = telemetry.tip
+    assert not telemetry.fault
     assert tip.contact_force[2] > 0.05
     # At rest the point that the arm follows is pulled as hard by the coupling as it is pushed by the tissue.
     np.testing.assert_allclose(tip.force, tip.contact_force, atol=2e-3)
@@ -49,10 +49,10 @@ def test_arm_follows_its_hand_and_feels_what_the_tissue_gives():
 def test_arm_lags_by_its_steering_alone():
     loop, (device,) = held_arms("phantom_small", "psm_palpator", [[0.006, 0.0, 0.0]], Hand(2000.0, 20.0))
     for _ in range(250):
-        told = loop.step()
+        telemetry = loop.step()
         device.advance()
     # 18 mm/s: behind by less than the time that it takes to catch up, and ten steps.
-    behind = loop.held[0].drive.position - told.tip.tip
+    behind = loop.held[0].drive.position - telemetry.tip.tip
     assert np.linalg.norm(behind) < 0.018 * (STEER_TIME + 10 * DT)
 
 
@@ -60,9 +60,9 @@ def test_two_hands_move_two_arms():
     loop, devices = held_arms("lobe", "psm_pair", [[0.0, 0.0, 0.006], [0.004, 0.0, 0.006]], Hand(1000.0, 10.0))
     start = [held.drive.tool.tip_position for held in loop.held]
     for _ in range(600):
-        told = loop.step()
+        telemetry = loop.step()
         for device in devices:
             device.advance()
-    assert not told.fault and len(told.tips) == 2
-    moved = [tip.tip - place for tip, place in zip(told.tips, start, strict=True)]
+    assert not telemetry.fault and len(telemetry.tips) == 2
+    moved = [tip.tip - place for tip, place in zip(telemetry.tips, start, strict=True)]
     np.testing.assert_allclose(moved, [[0.0, 0.0, 0.006], [0.004, 0.0, 0.006]], atol=1.5e-3)

@@ -50,9 +50,9 @@ def felt(anatomy: Anatomy, seconds: float, *, held: bool = False, deeper: float 
         hand=Hand(stiffness=3000.0, damping=5.0), path=lambda time: START - down * min(1.0, time / (0.6 * SETTLED))
     )
     rows = []
-    for told in run(HapticLoop(simulation, device), device, round((SETTLED + seconds) / DT)):
-        assert not told.fault
-        tip = told.tip
+    for telemetry in run(HapticLoop(simulation, device), device, round((SETTLED + seconds) / DT)):
+        assert not telemetry.fault
+        tip = telemetry.tip
         rows.append((tip.force[2], tip.depth, tip.tip[2], simulation.ground_shift(tip.tip)[2]))
     assert simulation.holds_breath == held
     return Felt(*np.array(rows[round(SETTLED / DT) :]).T)

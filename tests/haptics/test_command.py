@@ -21,12 +21,12 @@ def test_trajectory_runs_to_its_end_and_is_written(tmp_path, capsys):
     out = tmp_path / "out"
     arguments = ["haptics", "--scene", "phantom_small", "--trajectory", str(tmp_path / "press.csv"), "--out", str(out)]
     assert main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "coupling 500 N/m" in said and "haptic steps a second" in said
+    output = capsys.readouterr().out
+    assert "coupling 500 N/m" in output and "haptic steps a second" in output
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 601
-    rate, late = re.search(r"([\d.]+) haptic steps a second; late by [\d.]+ ms \(half\), ([\d.]+) ms", said).groups()
+    rate, late = re.search(r"([\d.]+) haptic steps a second; late by [\d.]+ ms \(half\), ([\d.]+) ms", output).groups()
     assert 0.0 < float(rate) < 1010.0
     assert 0.0 < float(late) <= 20.02
     assert float(rows[-1]["depth"]) > 1e-3
@@ -82,8 +82,8 @@ def test_bad_input_is_one_line(more, named, capsys):
     # Input that is accepted runs for ten steps.
     arguments = ["haptics", "--scene", "phantom_small", "--port", "0", "--seconds", "0.01", *more]
     assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert named in said and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert named in output and output.count("\n") == 1
 
 
 def test_ctrl_c_keeps_the_steps_until_then_whole(tmp_path, monkeypatch, capsys):

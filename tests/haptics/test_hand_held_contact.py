@@ -48,13 +48,13 @@ def pushed(what: dict, damping: float, share: float, count: int) -> tuple[float,
     device = held_device(made=UndeclaredDevice, **what)
     loop = HapticLoop(simulation, device, bare_settings(stiffness, damping))
     least, late_speed = 0.0, 0.0
-    for step, told in enumerate(run(loop, device, count)):
+    for step, telemetry in enumerate(run(loop, device, count)):
         least = min(least, -device.work)
         if least < GIVEN_FOR_GOOD:
             return least, np.inf
         if step > 0.8 * count:
             late_speed = max(late_speed, float(np.abs(device.velocity).max()))
-        if told.fault:
+        if telemetry.fault:
             return least, np.inf
     return least, late_speed
 
@@ -111,13 +111,13 @@ def tapping(device_mass: float, seconds: float, encoder: float) -> None:
     stiffest = limit(simulation, device.dynamics, chosen.damping)
     loop = HapticLoop(simulation, device, bare_settings(stiffest * (1.0 - 1e-9), chosen.damping))
     peaks, taken, largest = [], [], 0.0
-    for step, told in enumerate(run(loop, device, round(seconds / DT))):
-        assert not told.fault
+    for step, telemetry in enumerate(run(loop, device, round(seconds / DT))):
+        assert not telemetry.fault
         # Rounded to its encoder the device's place is off by half a count: that much work at the force that acts.
-        slack = ROUNDING + encoder * float(np.abs(told.tip.force).sum())
+        slack = ROUNDING + encoder * float(np.abs(telemetry.tip.force).sum())
         assert -device.work >= -slack
         # What the loop tells is what the handle had, but for what an encoder hides from the loop.
-        assert encoder or told.tip.energy == pytest.approx(-device.work, abs=ROUNDING)
+        assert encoder or telemetry.tip.energy == pytest.approx(-device.work, abs=ROUNDING)
         largest = max(largest, device.energy())
         if (step + 1) % 1000 == 0:
             peaks.append(largest)
@@ -142,8 +142,8 @@ def test_holding_dies_out():
     coupling = bare_settings((1.0 - 1e-9) * limit(simulation, device.dynamics, 0.125), 0.125)
     loop = HapticLoop(simulation, device, coupling)
     fastest = []
-    for step, told in enumerate(run(loop, device, 60_000)):
-        assert not told.fault
+    for step, telemetry in enumerate(run(loop, device, 60_000)):
+        assert not telemetry.fault
         assert -device.work >= -ROUNDING
         if step % 10_000 == 0:
             fastest.append(0.0)
@@ -157,8 +157,8 @@ def test_hand_feels_what_the_tissue_gives():
     simulation = touching_simulation()
     device = held_device()
     loop = HapticLoop(simulation, device, HapticSettings())
-    *_, told = run(loop, device, 6000)
-    tip = told.tip
+    *_, telemetry = run(loop, device, 6000)
+    tip = telemetry.tip
     np.testing.assert_allclose(tip.force, tip.contact_force, atol=2e-6)
     np.testing.assert_allclose(tip.force, [0.0, 0.0, 0.3], atol=2e-6)
     # Both ends of the spring: the tip lags by F / K.
@@ -174,11 +174,11 @@ def test_clamped_coupling_takes_energy_too():
     device = held_device(hand=Hand(stiffness=200.0, damping=2.0), path=lambda time: START - [0, 0, min(0.02, time)])
     settings = replace(bare_settings(400.0, 0.125), force_largest=1.0)
     loop = HapticLoop(simulation, device, settings)
-    for told in run(loop, device, 1500):
-        assert np.linalg.norm(told.tip.force) <= 1.0 + 1e-12
+    for telemetry in run(loop, device, 1500):
+        assert np.linalg.norm(telemetry.tip.force) <= 1.0 + 1e-12
         assert -device.work >= -ROUNDING
-    assert told.tip.clamped
-    assert np.linalg.norm(told.tip.force) == pytest.approx(1.0)
+    assert telemetry.tip.clamped
+    assert np.linalg.norm(telemetry.tip.force) == pytest.approx(1.0)
 
 
 def tapped_with_a_cut(settings: HapticSettings) -> tuple[np.ndarray, np.ndarray, float]:
@@ -189,13 +189,13 @@ def tapped_with_a_cut(settings: HapticSettings) -> tuple[np.ndarray, np.ndarray,
     )
     loop = HapticLoop(touching_simulation(), device, settings)
     held, hand, force, acted = [], [], 0.0, set()
-    for step, told in enumerate(run(loop, device, 5000)):
-        assert not told.fault
+    for step, telemetry in enumerate(run(loop, device, 5000)):
+        assert not telemetry.fault
         device.linked = not 1900 <= step < 2100
         held.append(-device.work)
         hand.append(device.energy())
-        force = max(force, float(np.linalg.norm(told.tip.coupling_force)))
-        acted |= {name for name in ("faded", "approaching") if getattr(told.tip, name)}
+        force = max(force, float(np.linalg.norm(telemetry.tip.coupling_force)))
+        acted |= {name for name in ("faded", "approaching") if getattr(telemetry.tip, name)}
     assert acted == {"faded", "approaching"}
     return np.array(held), np.array(hand), force**2 / (2.0 * loop.held[0].coupling.stiffness)
 

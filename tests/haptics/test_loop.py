@@ -64,10 +64,10 @@ def test_cut_link_fades_and_comes_back_gently():
     # Silent for 50 steps: the fiftieth is the first to fade, by a hundredth of it all.
     np.testing.assert_allclose(forces[49:148], before * (1.0 - np.arange(1, 100) / 100.0), rtol=0.03, atol=1e-9)
     np.testing.assert_allclose(forces[149:], 0.0, atol=1e-12)
-    told = loop.step()
-    assert told.tip.faded and told.tip.approaching and not told.tip.fresh and not told.fault
+    telemetry = loop.step()
+    assert telemetry.tip.faded and telemetry.tip.approaching and not telemetry.tip.fresh and not telemetry.fault
     # The tip stays in the organ where the last pose held it.
-    assert told.tip.depth == pytest.approx(3.4e-3, abs=4e-4)
+    assert telemetry.tip.depth == pytest.approx(3.4e-3, abs=4e-4)
     device.linked = True
     back = np.array([np.linalg.norm(loop.step().tip.force) for _ in range(520)])
     assert np.diff(back, prepend=0.0).max() < 1.1 * before / 500.0
@@ -96,13 +96,13 @@ def test_pose_that_jumps_does_not_throw_the_tip():
     for _ in range(700):
         loop.step()
     device.place = START + DOWN * 0.1
-    told = [loop.step() for _ in range(40)]
-    assert told[0].tip.speed_limited and not told[0].tip.approaching
-    steps = np.linalg.norm(np.diff([one.tip.target for one in told], axis=0), axis=1)
+    telemetry = [loop.step() for _ in range(40)]
+    assert telemetry[0].tip.speed_limited and not telemetry[0].tip.approaching
+    steps = np.linalg.norm(np.diff([record.tip.target for record in telemetry], axis=0), axis=1)
     assert steps.max() == pytest.approx(0.5 * DT)
-    assert any(one.tip.clamped for one in told)
-    assert max(np.linalg.norm(one.tip.coupling_force) for one in told) <= 3.0 + 1e-12
-    change = np.diff([one.tip.force for one in told], axis=0)
+    assert any(record.tip.clamped for record in telemetry)
+    assert max(np.linalg.norm(record.tip.coupling_force) for record in telemetry) <= 3.0 + 1e-12
+    change = np.diff([record.tip.force for record in telemetry], axis=0)
     assert np.linalg.norm(change, axis=1).max() <= 500.0 * DT + 1e-12
 
 
@@ -112,12 +112,12 @@ def test_pose_that_is_no_place_is_refused_and_counted(place):
     loop = HapticLoop(touching_simulation(), device)
     good = [loop.step() for _ in range(5)][-1]
     device.place = np.array([START[0], place, START[2]])
-    told = [loop.step() for _ in range(120)]
-    assert told[-1].tip.refused_pose_count == 120
+    telemetry = [loop.step() for _ in range(120)]
+    assert telemetry[-1].tip.refused_pose_count == 120
     # As good as none: the link counts as lost.
-    assert told[-1].tip.share == 0.0
-    np.testing.assert_array_equal(told[-1].tip.target, good.tip.target)
-    assert np.isfinite(told[-1].tip.tip).all() and not told[-1].fault
+    assert telemetry[-1].tip.share == 0.0
+    np.testing.assert_array_equal(telemetry[-1].tip.target, good.tip.target)
+    assert np.isfinite(telemetry[-1].tip.tip).all() and not telemetry[-1].fault
 
 
 def test_device_that_breaks_is_a_link_that_is_lost():
@@ -126,9 +126,9 @@ def test_device_that_breaks_is_a_link_that_is_lost():
     for _ in range(20):
         loop.step()
     device.broken = True
-    told = [loop.step() for _ in range(200)]
-    assert all("unplugged" in one.tip.device_fault for one in told)
-    assert told[-1].tip.share == 0.0 and not told[-1].fault
+    telemetry = [loop.step() for _ in range(200)]
+    assert all("unplugged" in record.tip.device_fault for record in telemetry)
+    assert telemetry[-1].tip.share == 0.0 and not telemetry[-1].fault
     device.broken = False
     assert loop.step().tip.device_fault == ""
 
@@ -141,31 +141,31 @@ def test_organ_that_comes_to_grief_lets_go_and_can_be_reset():
     loop.step()
     device.place = START + DOWN * 0.05
     for _ in range(400):
-        told = loop.step()
-        if told.fault:
+        telemetry = loop.step()
+        if telemetry.fault:
             break
-    assert "inside out" in told.fault or "passed" in told.fault or "beyond" in told.fault
-    np.testing.assert_array_equal(told.tip.force, 0.0)
+    assert "inside out" in telemetry.fault or "passed" in telemetry.fault or "beyond" in telemetry.fault
+    np.testing.assert_array_equal(telemetry.tip.force, 0.0)
     np.testing.assert_array_equal(device.force, 0.0)
-    stopped = told.time
+    stopped = telemetry.time
     later = [loop.step() for _ in range(20)][-1]
-    assert later.time == stopped and later.fault == told.fault
+    assert later.time == stopped and later.fault == telemetry.fault
     np.testing.assert_array_equal(device.force, 0.0)
     assert later.tip.fresh
     device.place = START
     loop.reset(tip_position=START)
     assert loop.fault == ""
-    told = [loop.step() for _ in range(50)][-1]
-    assert told.time == pytest.approx(0.05) and not told.fault and told.tip.energy == 0.0
+    telemetry = [loop.step() for _ in range(50)][-1]
+    assert telemetry.time == pytest.approx(0.05) and not telemetry.fault and telemetry.tip.energy == 0.0
 
 
 def test_a_warning_of_mujoco_lets_go():
     loop, device = pressed()
     assert np.linalg.norm(device.force) > 0.1
     loop.simulation.instrument.data.warning[mujoco.mjtWarning.mjWARN_BADQVEL].number += 1
-    told = loop.step()
-    assert told.fault == "MuJoCo warning mjWARN_BADQVEL"
-    np.testing.assert_array_equal(told.tip.force, 0.0)
+    telemetry = loop.step()
+    assert telemetry.fault == "MuJoCo warning mjWARN_BADQVEL"
+    np.testing.assert_array_equal(telemetry.tip.force, 0.0)
     np.testing.assert_array_equal(device.force, 0.0)
     loop.reset(tip_position=START)
     assert not loop.step().fault
@@ -211,15 +211,15 @@ def test_relative_device_begins_at_the_tip():
     np.testing.assert_allclose(loop.step().tip.target, START, atol=1e-15)
     device.place = device.place + np.array([0.001, 0.0, 0.002])
     for _ in range(100):
-        told = loop.step()
-    np.testing.assert_allclose(told.tip.target, START + np.array([0.001, 0.0, 0.002]), atol=1e-12)
+        telemetry = loop.step()
+    np.testing.assert_allclose(telemetry.tip.target, START + np.array([0.001, 0.0, 0.002]), atol=1e-12)
 
 
 def test_loop_repeats_to_the_bit():
     def forces() -> np.ndarray:
         device = held_device()
         loop = HapticLoop(touching_simulation(), device)
-        return np.array([told.tip.force for told in run(loop, device, 300)])
+        return np.array([telemetry.tip.force for telemetry in run(loop, device, 300)])
 
     np.testing.assert_array_equal(forces(), forces())
 

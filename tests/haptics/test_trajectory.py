@@ -46,9 +46,9 @@ def test_press_recorded_by_hand_is_felt(tmp_path):
     device = TrajectoryDevice.load(tmp_path / "press.csv")
     loop = HapticLoop(touching_simulation(), device, HapticSettings())
     while not device.over:
-        told = loop.step()
-    assert told.tip.depth == pytest.approx(2.6e-3, abs=3e-4)
-    np.testing.assert_allclose(device.force, told.tip.contact_force, atol=5e-3)
+        telemetry = loop.step()
+    assert telemetry.tip.depth == pytest.approx(2.6e-3, abs=3e-4)
+    np.testing.assert_allclose(device.force, telemetry.tip.contact_force, atol=5e-3)
     assert device.force[2] > 0.1
 
 

@@ -98,8 +98,8 @@ def test_loop_rides_on_a_flood(device, sender):
         for _ in range(3):
             other.raw(b"x" * (step + 1))
         sender.pose(step + 1, (0.0, 0.0, -1e-5 * step))
-        told = loop.step()
-    assert not told.fault
+        telemetry = loop.step()
+    assert not telemetry.fault
     counts = device.counts
     assert counts.accepted > 30 and counts.answered > 30
     other.socket.close()
@@ -113,8 +113,8 @@ def test_bridge_that_stops_sending_loses_its_force(device, sender):
     def steps(first: int, count: int, height: float) -> TipTelemetry:
         for sequence in range(first, first + count):
             sender.pose(sequence, (0.0, 0.0, height))
-            told = loop.step()
-        return told.tip
+            telemetry = loop.step()
+        return telemetry.tip
 
     # The first pose means where the tip is; then 3 mm down.
     steps(1, 1, 0.5)

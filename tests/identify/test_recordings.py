@@ -10,24 +10,24 @@ from tests.identify.made import HEADER, recording, write_csv
 def test_columns_in_any_order_in_si(tmp_path):
     path = tmp_path / "set.csv"
     path.write_text("normal_force_n,note,site,depth_mm\n0.1,a,4,0.5\n0.2,b,4,1.0\n\n0.3,c,2,0.7\n", encoding="utf-8")
-    found = read_recording(path)
-    assert found.name == "set" and not found.has_places and found.presses[0].time is None
-    assert [press.site for press in found.presses] == [4, 2]
-    np.testing.assert_allclose(found.presses[0].depth, [0.5e-3, 1.0e-3])
-    np.testing.assert_allclose(found.presses[0].force, [0.1, 0.2])
+    read = read_recording(path)
+    assert read.name == "set" and not read.has_places and read.presses[0].time is None
+    assert [press.site for press in read.presses] == [4, 2]
+    np.testing.assert_allclose(read.presses[0].depth, [0.5e-3, 1.0e-3])
+    np.testing.assert_allclose(read.presses[0].force, [0.1, 0.2])
 
 
 def test_what_is_written_is_read(tmp_path):
     made = recording(lambda depth: depth**1.5, time=np.linspace(0.1, 2.0, 20), samples=10)
-    found = read_recording(write_csv(made, tmp_path / "made.csv"))
-    assert found.has_places and found.presses[0].time is not None and len(found.presses) == len(made.presses)
-    for one, other in zip(found.presses, made.presses):
-        np.testing.assert_allclose(one.depth, other.depth, atol=1e-8)
-        np.testing.assert_allclose(one.force, other.force, atol=1e-8)
-        np.testing.assert_allclose(one.place, other.place, atol=1e-9)
-        np.testing.assert_allclose(one.time, other.time, atol=1e-5)
+    read = read_recording(write_csv(made, tmp_path / "made.csv"))
+    assert read.has_places and read.presses[0].time is not None and len(read.presses) == len(made.presses)
+    for press, other in zip(read.presses, made.presses):
+        np.testing.assert_allclose(press.depth, other.depth, atol=1e-8)
+        np.testing.assert_allclose(press.force, other.force, atol=1e-8)
+        np.testing.assert_allclose(press.place, other.place, atol=1e-9)
+        np.testing.assert_allclose(press.time, other.time, atol=1e-5)
         # At full depth from the tenth sample on: what follows is held.
-        assert one.loading == slice(0, 10)
+        assert press.loading == slice(0, 10)
 
 
 @pytest.mark.parametrize(

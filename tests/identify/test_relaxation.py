@@ -38,15 +38,15 @@ def test_arms_are_found_again():
     made = recording(area, count=12, samples=40, time=TIME, arms=ARMS, noise=0.01)
     held = held_sites(made.presses)
     assert len(held) == 12
-    found = fit_relaxation(CURVE, held[:6], held[6:], np.linspace(0.0, 1.5e-3, 31))
-    assert len(found.times) == 2
-    assert found.relative_moduli == pytest.approx(ARMS.moduli, rel=0.08)
-    assert found.times == pytest.approx(ARMS.times, rel=0.1)
+    fit = fit_relaxation(CURVE, held[:6], held[6:], np.linspace(0.0, 1.5e-3, 31))
+    assert len(fit.times) == 2
+    assert fit.relative_moduli == pytest.approx(ARMS.moduli, rel=0.08)
+    assert fit.times == pytest.approx(ARMS.times, rel=0.1)
     # 1 % of noise has a median size of 0.67 %.
-    assert found.error < 0.01 < found.elastic_error
+    assert fit.error < 0.01 < fit.elastic_error
 
 
 def test_elastic_tissue_has_no_arms():
     made = recording(area, count=12, samples=40, time=TIME, noise=0.01)
-    found = fit_relaxation(CURVE, made.presses[:6], made.presses[6:], np.linspace(0.0, 1.5e-3, 31))
-    assert found.times == ()
+    fit = fit_relaxation(CURVE, made.presses[:6], made.presses[6:], np.linspace(0.0, 1.5e-3, 31))
+    assert fit.times == ()

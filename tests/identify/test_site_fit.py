@@ -31,7 +31,7 @@ def test_the_wrong_shape_has_the_error_that_follows_from_it():
     """F = d against A = d^1.5 without offsets: E by least squares of the force, errors computed by hand."""
     depth = np.linspace(1.0, 10.0, 10) * 1e-4
     samples = SiteSamples.of([SitePress(0, np.zeros(3), depth, depth)], 0.0)
-    fits = fit_sites(sampled(lambda one: one**1.5, 1e-3), samples)
+    fits = fit_sites(sampled(lambda depth: depth**1.5, 1e-3), samples)
     modulus = (depth**2.5).sum() / (depth**3).sum()
     assert fits.modulus[0] == pytest.approx(modulus, rel=1e-3)
     deep = depth > depth[-1] / 3.0
@@ -42,17 +42,17 @@ def test_the_wrong_shape_has_the_error_that_follows_from_it():
 
 def test_sites_that_cannot_be_used_are_named_with_their_reason():
     made = recording(hertz)
-    one = made.presses[0]
+    press = made.presses[0]
 
-    def other(site, depth=one.depth, force=one.force):
-        return SitePress(site, one.place, depth, force)
+    def other(site, depth=press.depth, force=press.force):
+        return SitePress(site, press.place, depth, force)
 
     bad = [
-        other(100, depth=0.3 * one.depth),
-        other(101, depth=one.depth[[0, 1, 9]], force=one.force[[0, 1, 9]]),
-        other(102, force=-one.force),
-        other(103, force=np.full(len(one.force), 0.1)),
-        other(104, depth=20.0 * one.depth),
+        other(100, depth=0.3 * press.depth),
+        other(101, depth=press.depth[[0, 1, 9]], force=press.force[[0, 1, 9]]),
+        other(102, force=-press.force),
+        other(103, force=np.full(len(press.force), 0.1)),
+        other(104, depth=20.0 * press.depth),
     ]
     usable, left_out = sort_out([*made.presses, *bad])
     assert [site.site for site in usable] == [press.site for press in made.presses]

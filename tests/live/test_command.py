@@ -60,10 +60,10 @@ def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
     if how is not None:
         assert any(line == "recording\n" for line in run.stdout)
         run.send_signal(how)
-    told, _ = run.communicate(timeout=600)
+    output, _ = run.communicate(timeout=600)
     assert run.returncode == code
     assert [path.name for path in out.iterdir()] == ["recording-1.csv"]
-    assert "out: " in told and "steps written to recording-1.csv" in told
+    assert "out: " in output and "steps written to recording-1.csv" in output
     table = np.genfromtxt(out / "recording-1.csv", delimiter=",", names=True)
     assert len(table) > 100 and np.allclose(np.diff(table["time"]), 1e-3, atol=1e-6)
 

@@ -40,8 +40,8 @@ def browser(chromium):
 def test_software_is_known_and_draws_without_smoothed_edges(browser):
     assert browser.run("window.surgsim.software") is True
     attributes = "document.createElement('canvas').getContext('webgl2', {antialias: true, alpha: false})"
-    found = browser.run(attributes + ".getContextAttributes()")
-    assert not found["antialias"] and not found["preserveDrawingBuffer"] and not found["alpha"]
+    context = browser.run(attributes + ".getContextAttributes()")
+    assert not context["antialias"] and not context["preserveDrawingBuffer"] and not context["alpha"]
     # A canvas of another kind is none of its business.
     assert (
         browser.run("document.createElement('canvas').getContext('2d', {alpha: false}).getContextAttributes().alpha")

@@ -56,7 +56,7 @@ def test_touches_paint_it_where_they_were_felt_and_nowhere_else(anatomy, view):
     assert felt.felt.any() and not felt.felt.all()
     organ.paint(felt)
     organ.follow(anatomy.mesh.points)
-    painted = np.concatenate([one.vertices for name, one in sent.meshes.items() if name.startswith("/felt")]) / SCALE
+    painted = np.concatenate([mesh.vertices for name, mesh in sent.meshes.items() if name.startswith("/felt")]) / SCALE
     assert len(painted)
     # A vertex is painted only where all corners of its triangle were felt.
     nodes = anatomy.mesh.points[felt.nodes[felt.felt]]

@@ -93,19 +93,19 @@ def test_the_other_arm_of_one_is_the_same(served):
 
 def test_two_tabs_share_one_organ_and_one_may_go(served):
     path = press_path(served.session.anatomy)
-    one, other = ProtocolClient(served.address, path), ProtocolClient(served.address)
-    one.start()
-    other.start()
+    first, second = ProtocolClient(served.address, path), ProtocolClient(served.address)
+    first.start()
+    second.start()
     try:
-        wait_until(lambda: one.updates > 10 and other.updates > 10)
-        one.stop()
-        updates = other.updates
-        wait_until(lambda: other.updates > updates + 10)
+        wait_until(lambda: first.updates > 10 and second.updates > 10)
+        first.stop()
+        updates = second.updates
+        wait_until(lambda: second.updates > updates + 10)
         wait_until(lambda: len(served.page.server.viser.get_clients()) == 1)
     finally:
-        one.stop()
-        other.stop()
-    assert not other.errors
+        first.stop()
+        second.stop()
+    assert not second.errors
 
 
 def test_a_client_that_is_not_let_in_or_sends_no_more_says_so(served):

@@ -191,11 +191,11 @@ def test_nobody_left_ends_it(bench):
 def test_choices_are_what_they_say():
     anatomy = load_anatomy(live_scene(make_scene("liver")))
     plain = chosen_lesions(anatomy, OrganChoice())
-    assert [one.name for one in plain] == [one.name for one in anatomy.demonstration_lesions()]
+    assert [lesion.name for lesion in plain] == [lesion.name for lesion in anatomy.demonstration_lesions()]
     changed = chosen_lesions(anatomy, OrganChoice(modulus_factor=2.0, lesion_ratio=3.0, lesion_size=0.5))
-    for one, other in zip(plain, changed, strict=True):
-        assert other.radius == pytest.approx(0.5 * one.radius) and other.centre == one.centre
-        assert other.material.youngs_modulus == pytest.approx(6.0 * anatomy.scene.material.youngs_modulus)
+    for lesion, resized in zip(plain, changed, strict=True):
+        assert resized.radius == pytest.approx(0.5 * lesion.radius) and resized.centre == lesion.centre
+        assert resized.material.youngs_modulus == pytest.approx(6.0 * anatomy.scene.material.youngs_modulus)
     assert chosen_lesions(anatomy, OrganChoice(lesions=NONE)) == []
     hidden = [chosen_lesions(anatomy, OrganChoice(lesions=HIDDEN, seed=seed))[0].centre for seed in (1, 1, 2)]
     assert hidden[0] == hidden[1] != hidden[2]

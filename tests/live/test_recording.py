@@ -41,8 +41,8 @@ def test_a_recording_that_finds_no_space_leaves_nothing_and_is_named(tmp_path, m
 
     write_recording(made_steps(), tmp_path)
     monkeypatch.setattr("surgsim_apps.live.recording.np.savetxt", full)
-    told = write_recording(made_steps(), tmp_path)
-    assert told.startswith("the recording was not written: ") and "No space left on device" in told
+    sentence = write_recording(made_steps(), tmp_path)
+    assert sentence.startswith("the recording was not written: ") and "No space left on device" in sentence
     assert [path.name for path in tmp_path.iterdir()] == ["recording-1.csv"]
 
 

@@ -35,8 +35,8 @@ def test_fewer_substeps_feel_the_same():
     fewer = live_scene(scene)
     assert fewer.timing.substep_count < scene.timing.substep_count
     forces = []
-    for one in (scene, fewer):
-        anatomy = load_anatomy(one)
+    for variant in (scene, fewer):
+        anatomy = load_anatomy(variant)
         organ = chosen_organ(anatomy, OrganChoice())
         assert organ.added_mass <= ADDED_MASS_SHARE * organ.node_mass.sum()
         simulation, path = Simulation(anatomy), press_path(anatomy)

@@ -17,14 +17,14 @@ def states(capsys):
 
 def test_this_installation_is_sound(capsys):
     assert main(["doctor"]) == 0
-    found = states(capsys)
-    assert list(found)[:7] == [
+    report = states(capsys)
+    assert list(report)[:7] == [
         *("Python", "processor", "OpenGL", "compiled code", "haptic steps", "self-test", "packages"),
     ]
-    assert list(found)[7:] == sorted(doctor.FEATURES)
-    assert {state for state, _ in found.values()} <= {"ok", "missing"}
+    assert list(report)[7:] == sorted(doctor.FEATURES)
+    assert {state for state, _ in report.values()} <= {"ok", "missing"}
     for subject in ("self-test", "haptic steps", "packages", "live"):
-        assert found[subject][0] == "ok", found[subject]
+        assert report[subject][0] == "ok", report[subject]
 
 
 def test_every_extra_has_its_feature_named():
@@ -45,8 +45,8 @@ def test_a_check_that_fails_is_broken_and_the_others_go_on(monkeypatch, capsys):
 
     monkeypatch.setattr(doctor, "press", fails)
     assert main(["doctor"]) == 1
-    found = states(capsys)
-    assert found["fails"][1] == "broken   fails: RuntimeError: no such thing" and "packages" in found
+    report = states(capsys)
+    assert report["fails"][1] == "broken   fails: RuntimeError: no such thing" and "packages" in report
 
 
 def test_packages_that_are_absent_or_of_another_version(monkeypatch):
@@ -55,10 +55,10 @@ def test_packages_that_are_absent_or_of_another_version(monkeypatch):
     assert doctor.lack(Requirement("no-such-package")) == "no-such-package is not installed"
     required = ["numpy<1", "no-such-package>=2; extra == 'live'"]
     monkeypatch.setattr(metadata, "requires", lambda name: required)
-    found = {finding.subject: finding for finding in doctor.packages()}
-    assert found["packages"].state == "broken" and "numpy is" in found["packages"].text
-    assert found["live"].state == "missing" and "pip install 'surgsim[live]'" in found["live"].text
-    assert found["video"].state == "ok"
+    report = {finding.subject: finding for finding in doctor.packages()}
+    assert report["packages"].state == "broken" and "numpy is" in report["packages"].text
+    assert report["live"].state == "missing" and "pip install 'surgsim[live]'" in report["live"].text
+    assert report["video"].state == "ok"
 
 
 def test_no_opengl_and_no_cache_are_missing_features(monkeypatch):
@@ -68,5 +68,5 @@ def test_no_opengl_and_no_cache_are_missing_features(monkeypatch):
     monkeypatch.setattr(gl, "context", none)
     assert doctor.opengl().state == "missing" and "libegl1" in doctor.opengl().text
     monkeypatch.setattr(doctor.tempfile, "TemporaryFile", lambda dir: (_ for _ in ()).throw(OSError(30, "Read-only")))
-    found = doctor.cache()
-    assert found.state == "missing" and "NUMBA_CACHE_DIR" in found.text
+    report = doctor.cache()
+    assert report.state == "missing" and "NUMBA_CACHE_DIR" in report.text

@@ -130,9 +130,9 @@ def test_an_interrupt_during_a_scan_ends_after_the_press_at_hand(monkeypatch):
 )
 def test_bad_input_gets_one_line_and_exit_2(arguments, named, capsys):
     assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("surgsim: error: ") and said.count("\n") == 1, said
-    assert named in said
+    line = capsys.readouterr().err
+    assert line.startswith("surgsim: error: ") and line.count("\n") == 1, line
+    assert named in line
 
 
 @pytest.mark.parametrize(("arguments", "named"), [(["palpat"], "palpat"), (["palpate", "--sceen", "liver"], "--sceen")])

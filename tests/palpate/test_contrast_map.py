@@ -88,7 +88,8 @@ def test_order_is_by_strength_and_each_lesion_is_felt_once():
     sites = raster()
     bumps = [(0.05, 0.05, 0.35), (0.15, 0.11, 0.8), (0.10, 0.12, 0.5)]
     estimates = felt(sites, contrast_with_neighbours(stiffness_of(sites, *bumps, noise=0.01), sites[:, :2]))
-    assert [one.contrast for one in estimates] == sorted((one.contrast for one in estimates), reverse=True)
+    contrasts = [estimate.contrast for estimate in estimates]
+    assert contrasts == sorted(contrasts, reverse=True)
     truths = [truth_at(x, y, f"{height}") for x, y, height in bumps]
     scored = score_map("m", sites, np.ones(len(sites)), estimates, truths, SURFACE, spacing=SPACING)
     assert [score.estimate for score in scored.scores] == [2, 0, 1]
@@ -125,7 +126,7 @@ def test_score_counts_misses_false_alarms_and_the_healthy_spread():
     assert not second.felt
     assert scored.felt_count == 1
     assert scored.false_alarms == 1
-    distance = np.min([np.linalg.norm(sites - one.point, axis=1) for one in truths], axis=0)
+    distance = np.min([np.linalg.norm(sites - truth.point, axis=1) for truth in truths], axis=0)
     healthy = contrast[distance > RADIUS + 0.015]
     assert scored.healthy_std == pytest.approx(healthy.std())
     over = contrast[np.linalg.norm(sites - truths[0].point, axis=1) <= RADIUS]
@@ -178,5 +179,5 @@ def test_readings_along_normals_are_those_of_the_three_axes():
     force, sensor = np.array([0.5, 0.2, 0.9]), ForceSensor(noise=0.01, bias=0.05, range=10.0)
     rng, reading = np.random.default_rng(3), ForceReading(sensor)
     reading.reset(rng)
-    single = [reading.read(one * normal, rng, 0.0)[0] @ normal for one, normal in zip(force, normals, strict=True)]
+    single = [reading.read(size * normal, rng, 0.0)[0] @ normal for size, normal in zip(force, normals, strict=True)]
     np.testing.assert_allclose(scanned(force, normals, sensor), single, rtol=1e-12)

@@ -54,9 +54,9 @@ def missed(monkeypatch, *lesions, forces=(0.30, 0.20), estimates=(), sites=SITES
     felt = iter(forces * len(lesions))
     monkeypatch.setattr(misses, "scan", lambda *args, **options: [SimpleNamespace(force=next(felt))])
     truths = seen_from_surface(lesions, ANATOMY)
-    found = [Estimate(np.array(place), 1.5, 0.5) for place in estimates]
-    one = score_map("m", sites, np.ones(len(sites)), found, truths, ANATOMY.along_surface, spacing=SPACING)
-    return explain_misses(ANATOMY, ANATOMY.organ(lesions), lesions, truths, (one,), sites, early)
+    estimates = [Estimate(np.array(place), 1.5, 0.5) for place in estimates]
+    contrast_map = score_map("m", sites, np.ones(len(sites)), estimates, truths, ANATOMY.along_surface, spacing=SPACING)
+    return explain_misses(ANATOMY, ANATOMY.organ(lesions), lesions, truths, (contrast_map,), sites, early)
 
 
 def test_a_lesion_that_is_felt_needs_no_reason(monkeypatch):

@@ -24,10 +24,10 @@ def refusal(capsys) -> Callable[..., str]:
     """A function that gives a command line and returns the one line on standard error that refuses it."""
 
     def refuse(*arguments) -> str:
-        assert main([str(one) for one in arguments]) == 2
-        said = [line for line in capsys.readouterr().err.splitlines() if "surgsim: warning" not in line]
-        assert len(said) == 1
-        assert "Traceback" not in said[0]
-        return said[0]
+        assert main([str(argument) for argument in arguments]) == 2
+        lines = [line for line in capsys.readouterr().err.splitlines() if "surgsim: warning" not in line]
+        assert len(lines) == 1
+        assert "Traceback" not in lines[0]
+        return lines[0]
 
     return refuse

@@ -49,7 +49,7 @@ def write_segmentation(path: Path, masks: dict[str, np.ndarray], spacing, origin
         BitsStored=1,
         HighBit=0,
         PixelRepresentation=0,
-        SegmentSequence=Sequence([item(SegmentNumber=n, SegmentLabel=one) for n, one in enumerate(masks, start=1)]),
+        SegmentSequence=Sequence([item(SegmentNumber=n, SegmentLabel=name) for n, name in enumerate(masks, start=1)]),
         SharedFunctionalGroupsSequence=Sequence(
             [
                 item(

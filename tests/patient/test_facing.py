@@ -40,26 +40,26 @@ def angles(approach, *inward):
 
 @pytest.mark.parametrize("centres", [{}, {"a": (0.04, 0.04, 0.066)}])
 def test_the_usual_approach_stays_where_it_faces_them(centres):
-    found = patient(**centres)
-    assert facing_approach(found, USUAL, ANGLE) == USUAL
-    assert faced_note(found, scene(USUAL)) == []
+    organ = patient(**centres)
+    assert facing_approach(organ, USUAL, ANGLE) == USUAL
+    assert faced_note(organ, scene(USUAL)) == []
 
 
 def test_it_turns_to_a_lesion_on_the_flank_but_no_farther_than_needed():
-    found = patient(a=(0.066, 0.04, 0.04))
-    approach = np.array(facing_approach(found, USUAL, ANGLE))
+    organ = patient(a=(0.066, 0.04, 0.04))
+    approach = np.array(facing_approach(organ, USUAL, ANGLE))
     (angle,) = angles(approach, [-1.0, 0.0, 0.0])
     # The directions that are tried lie 9 degrees apart.
     assert ANGLE - MARGIN_DEG - 12.0 < angle <= ANGLE - MARGIN_DEG
     assert np.linalg.norm(approach) == pytest.approx(1.0)
-    assert "does not face a:" in faced_note(found, scene(USUAL))[0]
-    assert faced_note(found, scene(approach)) == []
+    assert "does not face a:" in faced_note(organ, scene(USUAL))[0]
+    assert faced_note(organ, scene(approach)) == []
 
 
 def test_it_faces_two_of_three():
     """Above and on one flank, and below: no direction faces above and below."""
-    found = patient(above=(0.04, 0.04, 0.066), flank=(0.066, 0.04, 0.04), below=(0.04, 0.04, 0.014))
-    approach = np.array(facing_approach(found, USUAL, ANGLE))
+    organ = patient(above=(0.04, 0.04, 0.066), flank=(0.066, 0.04, 0.04), below=(0.04, 0.04, 0.014))
+    approach = np.array(facing_approach(organ, USUAL, ANGLE))
     above, flank, below = angles(approach, [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     assert above <= ANGLE - MARGIN_DEG + 1e-9 and flank <= ANGLE - MARGIN_DEG + 1e-9 and below > 90.0
-    assert [note.split(":")[0].split("face ")[1] for note in faced_note(found, scene(approach))] == ["below"]
+    assert [note.split(":")[0].split("face ")[1] for note in faced_note(organ, scene(approach))] == ["below"]

@@ -96,10 +96,10 @@ def test_parts_without_tets_are_drawn_on_the_boundary_and_counted():
     spiked[top, 2] += 0.02
     mesh = mesh_surface(ball.vertices, ball.faces, cell_size=0.006)
     fit = fitted_surface(spiked, np.array(ball.faces), mesh, 0.006)
-    found = find_carriers(fit.vertices, mesh)
-    assert not found.beyond.any() and fit.moved > 0
-    assert np.count_nonzero(found.distance < 1e-12) == fit.moved
-    assert fit.vertices[:, 2].max() < RADIUS + found.reach.max() < spiked[top, 2]
+    carriers = find_carriers(fit.vertices, mesh)
+    assert not carriers.beyond.any() and fit.moved > 0
+    assert np.count_nonzero(carriers.distance < 1e-12) == fit.moved
+    assert fit.vertices[:, 2].max() < RADIUS + carriers.reach.max() < spiked[top, 2]
     assert f"{fit.moved} vertices that were farther" in fit.text
     assert fitted_surface(np.array(ball.vertices), np.array(ball.faces), mesh, 0.006).moved == 0
 
@@ -110,9 +110,9 @@ def test_the_reach_does_not_depend_on_which_of_equally_near_triangles_is_found()
     mesh = mesh_surface(ball.vertices, ball.faces, cell_size=0.006)
     above = 1.1 * mesh.points[mesh.boundary_triangles[:, :2]].mean(axis=1)
     rng = np.random.default_rng(0)
-    found = [find_carriers(above + rng.normal(0.0, 1e-9, above.shape), mesh) for _ in range(4)]
-    assert (np.ptp([one.triangle for one in found], axis=0) > 0).any()
-    reaches = np.array([one.reach for one in found])
+    carriers = [find_carriers(above + rng.normal(0.0, 1e-9, above.shape), mesh) for _ in range(4)]
+    assert (np.ptp([carrier.triangle for carrier in carriers], axis=0) > 0).any()
+    reaches = np.array([carrier.reach for carrier in carriers])
     assert np.ptp(reaches, axis=0).max() < 1e-5 * reaches.min()
     assert np.ptp(reaches[0]) > 0.1 * reaches[0].mean()
 

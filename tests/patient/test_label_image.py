@@ -72,10 +72,10 @@ def test_what_simpleitk_reads_lies_there_too(suffix, tmp_path):
     if suffix == ".dcm":
         image = SimpleITK.Cast(image, SimpleITK.sitkUInt16)
     SimpleITK.WriteImage(image, str(tmp_path / f"a{suffix}"))
-    found = read_label_image(tmp_path / f"a{suffix}", BOTH)
+    image = read_label_image(tmp_path / f"a{suffix}", BOTH)
     if suffix != ".dcm":  # SimpleITK writes no place of a volume's slices into a DICOM file
-        check_organ(found, (2.0, 2.0, 3.0))
-    assert np.count_nonzero(found.tags) == np.count_nonzero(labels)
+        check_organ(image, (2.0, 2.0, 3.0))
+    assert np.count_nonzero(image.tags) == np.count_nonzero(labels)
 
 
 def test_nrrd_without_a_space_says_what_is_taken(tmp_path):
@@ -191,7 +191,7 @@ def test_labels_that_make_no_sense(text, words):
 
 
 def test_labels_are_read_in_order():
-    assert [(one.name, one.value) for one in parse_labels("left kidney = 7 ,lesion=2")] == [
+    assert [(label.name, label.value) for label in parse_labels("left kidney = 7 ,lesion=2")] == [
         ("left kidney", 7),
         ("lesion", 2),
     ]

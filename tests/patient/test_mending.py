@@ -25,13 +25,13 @@ def test_surfaces_one_file_a_region(tmp_path, capsys):
         assert mesh.volumes[mesh.region == tag].sum() == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.06)
     scene = load_scene(out / "k.toml")
     assert scene.material.youngs_modulus == 8000
-    assert [(one.name, one.lesion, one.material.youngs_modulus) for one in scene.regions] == [
+    assert [(region.name, region.lesion, region.material.youngs_modulus) for region in scene.regions] == [
         ("tumour", True, 32000.0),
         ("stone", False, 90000.0),
     ]
     # What is no lesion is in every organ.
     anatomy = load_anatomy(scene)
-    assert [one.region for one in anatomy.specification().lesions] == ["stone"]
+    assert [lesion.region for lesion in anatomy.specification().lesions] == ["stone"]
     assert "nothing is known" not in capsys.readouterr().out
 
 

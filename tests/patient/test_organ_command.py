@@ -39,7 +39,7 @@ def test_a_modulus_is_for_a_region_s_name_or_the_name_before_its_number():
     organ = organ_material("liver").material
     for given in ("lesion", "lesion 2", "portal vein"):
         _check_moduli({given: 1.0}, names)
-        assert any(region_material(one, "liver", organ, {given: 1.0}).material.youngs_modulus == 1.0 for one in names)
+        assert any(region_material(name, "liver", organ, {given: 1.0}).material.youngs_modulus == 1.0 for name in names)
     for given in ("portal", "lesion 3", "vein"):
         with pytest.raises(ValueError, match="no such region; there are lesion 1, lesion 2, portal vein"):
             _check_moduli({given: 1.0}, names)
@@ -47,10 +47,10 @@ def test_a_modulus_is_for_a_region_s_name_or_the_name_before_its_number():
 
 def test_the_scene_has_what_was_segmented(anatomy):
     scene = anatomy.scene
-    assert [(one.name, one.lesion) for one in scene.regions] == [("lesion 1", True), ("lesion 2", True)]
+    assert [(region.name, region.lesion) for region in scene.regions] == [("lesion 1", True), ("lesion 2", True)]
     assert scene.regions[0].material.youngs_modulus == pytest.approx(8 * scene.material.youngs_modulus)
     lesions = anatomy.demonstration_lesions()
-    assert [one.region for one in lesions] == ["lesion 1", "lesion 2"]
+    assert [lesion.region for lesion in lesions] == ["lesion 1", "lesion 2"]
     healthy, ill = anatomy.organ(), anatomy.organ(lesions)
     assert ill.spring_stiffness.sum() > 1.05 * healthy.spring_stiffness.sum()
     # The chosen substeps hold for both.

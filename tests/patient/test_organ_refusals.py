@@ -16,7 +16,7 @@ def test_nothing_half_written(tmp_path, refusal):
     assert "approach is (0.0, 0.0, 0.0)" in refusal(*given, "--approach", "0,0,0")
     assert not list(out.iterdir())
     for _ in range(2):
-        assert main([str(one) for one in given]) == 0
+        assert main([str(argument) for argument in given]) == 0
     assert {path.name for path in out.iterdir()} == {"a.vtu", "a.toml", "a_surface.ply", "report.html"}
 
 
@@ -43,8 +43,8 @@ def test_surfaces_of_regions_that_are_no_one_body(tmp_path, refusal):
     two.export(tmp_path / "stone.stl")
     assert "region 'stone' has 2 surfaces, and one is taken" in refusal("organ", organ, tmp_path / "stone.stl", *given)
     torn = ball(tmp_path / "lesion.stl", 9.0, drop=4)
-    said = refusal("organ", organ, torn, *given)
-    assert "lesion.stl" in said and "the surface is open" in said
+    line = refusal("organ", organ, torn, *given)
+    assert "lesion.stl" in line and "the surface is open" in line
     sheets = trimesh.creation.box((60.0, 60.0, 60.0))
     trimesh.Trimesh(sheets.vertices, sheets.faces[:1]).export(tmp_path / "sheet.stl")
     assert "encloses nothing, also when mended" in refusal("organ", tmp_path / "sheet.stl", "--mend", *given)

@@ -24,17 +24,18 @@ def anchors(name, *, is_scan=True):
     ],
 )
 def test_tissues_go_by_the_organ_s_name(name, tissues):
-    found, sources = anchors(name)
-    assert [one.name for one in found] == tissues
-    assert all(one.is_elastic for one in found)
-    assert {f"anchors[{number}].stiffness" for number in range(len(found))} <= set(sources)
+    supports, sources = anchors(name)
+    assert [anchor.name for anchor in supports] == tissues
+    assert all(anchor.is_elastic for anchor in supports)
+    assert {f"anchors[{number}].stiffness" for number in range(len(supports))} <= set(sources)
     # In axes that mean nothing nobody knows where a hilum is.
-    assert [one.name for one in anchors(name, is_scan=False)[0]] == tissues[:1]
+    assert [anchor.name for anchor in anchors(name, is_scan=False)[0]] == tissues[:1]
 
 
 def test_the_hilum_faces_the_spine():
     """x points to the patient's left: the left kidney has its hilum at low x, the right one at high x."""
-    left, right = (next(one.ball for one in anchors(name)[0] if one.ball) for name in ("left kidney", "right kidney"))
+    names = ("left kidney", "right kidney")
+    left, right = (next(anchor.ball for anchor in anchors(name)[0] if anchor.ball) for name in names)
     middle = MESH.points.mean(axis=0)
     assert left.centre[0] < middle[0] - 0.02 and right.centre[0] > middle[0] + 0.02
     assert np.linalg.norm(MESH.points[MESH.boundary_nodes] - left.centre, axis=1).min() < 1e-4

@@ -33,7 +33,7 @@ def test_tets_are_kept_and_their_regions_named(tmp_path):
     assert given.volume == pytest.approx(SIDE * SIDE * 0.04)
     patient = patient_of_tets(given, 0.01)
     assert patient.lesions == ("tumour",)
-    assert [one.name for one in patient.volumes] == ["kidney", "tumour"]
+    assert [region.name for region in patient.volumes] == ["kidney", "tumour"]
     mesh = block()
     assert patient.volumes[1].mesh == pytest.approx(mesh.volumes[mesh.region == 7].sum())
 
@@ -64,7 +64,7 @@ def test_a_scene_is_made_of_tets(tmp_path):
     assert main(["organ", str(file), "--no-healthy-map", "--out", str(out)]) == 0
     assert {path.name for path in out.parent.iterdir()} >= {"patient.vtu", "patient.toml", "report.html"}
     scene = load_scene(out.with_suffix(".toml"))
-    assert [(one.name, one.lesion) for one in scene.regions] == [("tumour", True)]
+    assert [(region.name, region.lesion) for region in scene.regions] == [("tumour", True)]
     anatomy = load_anatomy(scene)
     assert np.array_equal(np.sort(anatomy.mesh.volumes), np.sort(read_mesh(out).volumes))
     assert len(anatomy.demonstration_lesions()) == 1

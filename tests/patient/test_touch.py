@@ -75,9 +75,9 @@ def test_the_plan_is_said_with_a_coarser_choice_before_the_mesh(tmp_path, capsys
     """The cells of this tip are finer than any mesh may have, so that the command ends there."""
     given = ["organ", str(ball(tmp_path / "liver.stl")), "--length-unit", "mm", "--tip-radius", "0.00012"]
     assert main(given) == 2
-    said = capsys.readouterr()
-    assert "nodes" in said.out and "times real time" in said.out and "coarser: --tip-radius" in said.out
-    assert "filling it with tets" in said.out
+    printed = capsys.readouterr()
+    assert "nodes" in printed.out and "times real time" in printed.out and "coarser: --tip-radius" in printed.out
+    assert "filling it with tets" in printed.out
 
 
 @pytest.fixture(scope="module")

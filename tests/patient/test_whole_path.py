@@ -61,9 +61,9 @@ def stl(surface: trimesh.Trimesh, path: Path) -> Path:
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """What a command prints, from which nothing must be missing or amiss."""
     capsys.readouterr()
-    assert main([str(one) for one in arguments]) == 0
-    said = capsys.readouterr()
-    return said.out + said.err
+    assert main([str(argument) for argument in arguments]) == 0
+    printed = capsys.readouterr()
+    return printed.out + printed.err
 
 
 def fits(anatomy: Anatomy, point: np.ndarray, radius: float) -> bool:
@@ -79,10 +79,10 @@ def far_apart(anatomy: Anatomy, lesion: Hidden) -> list[int]:
     """Two sites of the raster away from its rim and from each other, below which a lesion fits."""
     sites, normals, _ = plan_sites(anatomy)
     rim = np.array([anatomy.face.rim_distance(site) for site in sites])
-    inner = [int(one) for one in np.flatnonzero(rim >= np.median(rim))]
-    inner = [one for one in inner if fits(anatomy, sites[one] - lesion.depth * normals[one], lesion.radius)]
+    inner = [int(site) for site in np.flatnonzero(rim >= np.median(rim))]
+    inner = [site for site in inner if fits(anatomy, sites[site] - lesion.depth * normals[site], lesion.radius)]
     distance = np.linalg.norm(sites[inner][:, None] - sites[inner], axis=2)
-    return [inner[one] for one in np.unravel_index(np.argmax(distance), distance.shape)]
+    return [inner[index] for index in np.unravel_index(np.argmax(distance), distance.shape)]
 
 
 def check_held(summary: dict) -> None:
@@ -95,10 +95,10 @@ def check_held(summary: dict) -> None:
 def check_found(summary: dict, count: int) -> None:
     """The model map shows every lesion, and either map says why it misses one."""
     assert len(summary["truth"]) == count
-    one = summary["maps"][MODEL]
-    assert one["felt"] == count and one["false_alarms"] == 0, one
-    for found in summary["maps"].values():
-        for lesion in found["lesions"]:
+    entry = summary["maps"][MODEL]
+    assert entry["felt"] == count and entry["false_alarms"] == 0, entry
+    for entry in summary["maps"].values():
+        for lesion in entry["lesions"]:
             assert lesion["felt"] or (lesion["miss"] and lesion["why"]), lesion
 
 
@@ -116,39 +116,39 @@ def check_report(folder: Path, name: str) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert page.rstrip().endswith("</html>")
     assert "data:image/png;base64," in page
-    assert all(held_text(one) in html.unescape(page) for one in load_scene(folder / f"{name}.toml").anchors)
+    assert all(held_text(anchor) in html.unescape(page) for anchor in load_scene(folder / f"{name}.toml").anchors)
 
 
 def test_from_a_surface_to_lesions_on_a_map(tmp_path, capsys):
     name, surface, touch, lesion = "kidney", kidney_surface(), KIDNEY, Hidden(0.013, 0.009)
     file, folder = stl(surface, tmp_path / f"{name}.stl"), tmp_path / "patient"
     given = ["organ", file, "--length-unit", "mm", "--tip-radius", touch.tip, "--out", folder / f"{name}.vtu"]
-    said = run(capsys, *given, "--no-healthy-map")
-    assert "sways" not in said and "of Hertz's force" in said
+    printed = run(capsys, *given, "--no-healthy-map")
+    assert "sways" not in printed and "of Hertz's force" in printed
     check_report(folder, name)
     scene, out = folder / f"{name}.toml", tmp_path / "palpated"
     anatomy = load_anatomy(with_options(load_scene(scene), SceneOptions(spacing=touch.spacing)))
     hidden = [
         f"--lesion-below={site},{lesion.depth},{lesion.radius},{LESION_RATIO}" for site in far_apart(anatomy, lesion)
     ]
-    said = run(capsys, "palpate", "--organ", scene, "--spacing", touch.spacing, *hidden, "--out", out)
+    printed = run(capsys, "palpate", "--organ", scene, "--spacing", touch.spacing, *hidden, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     check_held(summary)
     check_found(summary, 2)
     check_files(out, summary)
-    assert "pre-operative model: all 2 lesions felt" in said
+    assert "pre-operative model: all 2 lesions felt" in printed
 
 
 def test_from_a_scan_with_its_lesions_to_a_map(tmp_path, capsys):
     """Cells as by default, fine at the pressed face, so that the probe is turned before they are made."""
     out = tmp_path / "out"
     given = ["organ", spleen(tmp_path / "spleen.nii.gz"), "--labels", "spleen=1,lesion=2", "--no-healthy-map"]
-    said = run(capsys, *given, "--tip-radius", SPLEEN.tip, "--out", out / "spleen.vtu")
-    assert "turning the probe to the lesions" in said and "does not face" not in said
-    assert "times as long elsewhere" in said
+    printed = run(capsys, *given, "--tip-radius", SPLEEN.tip, "--out", out / "spleen.vtu")
+    assert "turning the probe to the lesions" in printed and "does not face" not in printed
+    assert "times as long elsewhere" in printed
     scene = load_scene(out / "spleen.toml")
     assert -np.dot(scene.instrument.approach, SPLEEN_CROWN) > 0.7
-    assert [one.name for one in scene.anchors] == ["surrounding fat and wall", "hilum"]
+    assert [anchor.name for anchor in scene.anchors] == ["surrounding fat and wall", "hilum"]
     check_report(out, "spleen")
     run(capsys, "palpate", "--organ", out / "spleen.toml", "--spacing", SPLEEN.spacing, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))

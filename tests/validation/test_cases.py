@@ -30,12 +30,13 @@ PARAMETERS = [
 
 @pytest.mark.parametrize("case", PARAMETERS)
 def test_case(case: Case):
-    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=(case,))
-    assert found.rows
-    said = [f"{row.case}: expected {row.expected:.6g}, measured {row.measured:.6g}" for row in found.unexplained]
-    assert not said, "not met, and not a known shortfall or worse than known"
-    assert not found.outdated, "no longer a shortfall"
-    missing = {row.case for row in found.rows} - {line["case"] for line in TABLE}
+    validation = suite.run_cases(quick=False, console=Console(quiet=True), cases=(case,))
+    assert validation.rows
+    rows = validation.unexplained
+    unmet = [f"{row.case}: expected {row.expected:.6g}, measured {row.measured:.6g}" for row in rows]
+    assert not unmet, "not met, and not a known shortfall or worse than known"
+    assert not validation.outdated, "no longer a shortfall"
+    missing = {row.case for row in validation.rows} - {line["case"] for line in TABLE}
     assert not missing, "docs/validation.csv is older than these rows: run surgsim validate"
 
 
@@ -72,12 +73,12 @@ def test_a_run_passes_only_where_every_shortfall_is_known(monkeypatch):
     cases = (Case("good", lambda: [row("good", 1.0)]), Case("bad", lambda: [row("bad", 2.0)]))
     known = {"good": suite.Shortfall("once", 1.0)}
     monkeypatch.setattr(suite, "load_shortfalls", lambda: known)
-    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
-    assert not found.passed and [one.case for one in found.unexplained] == ["bad"]
-    assert found.outdated == ["good"]
+    validation = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
+    assert not validation.passed and [row.case for row in validation.unexplained] == ["bad"]
+    assert validation.outdated == ["good"]
     known.clear()
     known["bad"] = suite.Shortfall("soft", 1.0)
-    found = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
-    assert found.passed and found.reason(found.rows[1]) == "soft"
+    validation = suite.run_cases(quick=False, console=Console(quiet=True), cases=cases)
+    assert validation.passed and validation.reason(validation.rows[1]) == "soft"
     known["bad"] = suite.Shortfall("soft", 0.9)
     assert not suite.run_cases(quick=False, console=Console(quiet=True), cases=cases).passed

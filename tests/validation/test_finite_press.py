@@ -45,8 +45,8 @@ def test_a_softer_contact_takes_what_is_said():
     """
     body = PressedLayer(layer_mesh(0.08, 0.08, 1e-3, (0.016, 0.012)), lambda r, z: np.full_like(r, 5000.0), 0.45)
     rigid, soft = (body.forces(0.012, (0.003,), k)[0] for k in (RIGID, 2e7))
-    said = hidden_share(rigid, 0.012, 0.003, 2e7)
-    assert 0.35 * said < 1.0 - soft / rigid < 0.65 * said
+    share = hidden_share(rigid, 0.012, 0.003, 2e7)
+    assert 0.35 * share < 1.0 - soft / rigid < 0.65 * share
 
 
 def test_a_membrane_makes_the_press_stiffer_by_little():
@@ -54,8 +54,8 @@ def test_a_membrane_makes_the_press_stiffer_by_little():
     mesh = layer_mesh(0.08, 0.08, 1.5e-3, (0.015, 0.012))
     plain, covered = (
         np.array(
-            PressedLayer(mesh, lambda r, z: np.full_like(r, 5000.0), 0.45, membrane=one).forces(0.012, (0.003, 0.005))
+            PressedLayer(mesh, lambda r, z: np.full_like(r, 5000.0), 0.45, membrane=size).forces(0.012, (0.003, 0.005))
         )
-        for one in (0.0, 20.0)
+        for size in (0.0, 20.0)
     )
     assert ((covered / plain > 1.015) & (covered / plain < 1.06)).all()

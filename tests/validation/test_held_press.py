@@ -67,7 +67,7 @@ class HeldSolid:
         near = facets[np.linalg.norm(middles[facets] - site, axis=1) < 1.5 * TIP]
         surface = FacetBasis(mesh, self.basis.elem, facets=near, intorder=6)
         dofs = surface.element_dofs
-        values = np.array([np.broadcast_to(np.array(one[0]), (3, *surface.dx.shape)) for one in surface.basis])
+        values = np.array([np.broadcast_to(np.array(shape[0]), (3, *surface.dx.shape)) for shape in surface.basis])
         place = np.asarray(surface.global_coordinates())
         centre = (site + (TIP - DEPTH) * normal)[:, None, None]
         near_inverse = LinearOperator(self.stiffness.shape, self.precondition, dtype=np.float64)

@@ -35,16 +35,16 @@ def body(arms=ARMS):
 
 
 def test_a_held_body_relaxes_by_the_closed_form():
-    one = body()
+    solid = body()
     still = np.array([0.1, 0.2])
     # A ramp so short that it is a step.
     durations = [1e-6, *np.diff(np.concatenate([[0.0], TIME]))]
     forces = []
     for duration in durations:
-        stiffness, load = one.step(duration)
+        stiffness, load = solid.step(duration)
         forces.append(stiffness @ still - load)
-        one.accept(still, duration)
-    elastic, volume = one.springs @ still, one.volume @ still
+        solid.accept(still, duration)
+    elastic, volume = solid.springs @ still, solid.volume @ still
     expected = ARMS.remaining(TIME)[:, None] * elastic + volume
     np.testing.assert_allclose(forces[1:], expected, rtol=1e-4)
 
@@ -54,13 +54,13 @@ def test_a_loaded_body_creeps_and_its_steps_converge():
     load, end = np.array([0.0, 1.0]), 3.0
 
     def crept(count):
-        one = body()
+        solid = body()
         duration = end / count
         for _ in range(count):
-            stiffness, kept = one.step(duration)
+            stiffness, kept = solid.step(duration)
             displacement = spsolve(stiffness, load + kept)
-            one.accept(np.asarray(displacement), duration)
-        return one.displacement[1]
+            solid.accept(np.asarray(displacement), duration)
+        return solid.displacement[1]
 
     values = [crept(count) for count in (200, 400, 800, 1600)]
     steps = np.abs(np.diff(values))

@@ -343,7 +343,7 @@ def _touch(lanes, model, state, shapes, law, response, dt, decay, squeezed_count
 
 @njit(**INLINED)
 def _move_ground(lanes, model, state, dt, decay):
-    """Move the ground of moving organs: foundations and supports now, anchored nodes by the integration after it."""
+    """Move the ground of the moving organs: foundations and supports now, anchored nodes by the integration."""
     if model.motion_node_shift.shape[0] == 0:
         return
     _, velocity, _ = nodes_of(lanes, state)

@@ -172,7 +172,7 @@ def test_wrong_options_are_refused() -> None:
         (["--agent", "surgsim_apps.scoring.site_search:Nobody"], "has no class 'Nobody'"),
         (["--agent", "surgsim_apps.scoring.evaluate:Player"], "missing"),
         (["--agent", "surgsim_apps.scoring.site_search:SiteFacts"], "missing"),
-        (["--agent", "expert_retract", "--level", "hard"], "argument 'level' is unknown"),
+        (["--agent", "expert_retract", "--level", "hard"], "level 'hard' has nothing to hide"),
         (["--agent", "expert_retract", "--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
         (["--agent", "expert_retract", "--budget", "3"], "--budget is the number of presses"),
         (["--agent", "expert_retract", "--no-tracking"], "--no-tracking is for the presses"),
@@ -306,7 +306,7 @@ def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     ("policy", "options", "message"),
     [
         ("palpate_phantom_small_scratch", ["--scene", "phantom"], r"trained on the scene 'phantom_small', .* cannot"),
-        ("retract_dagger", ["--level", "hard"], "argument 'level' is unknown"),
+        ("retract_dagger", ["--level", "hard"], "level 'hard' has nothing to hide"),
         ("retract_dagger", ["--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
     ],
 )

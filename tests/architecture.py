@@ -23,7 +23,7 @@ ORDER = {
     "": ("msdm_core", "surgsim_env", "surgsim_apps", "scenes", "agents", "benchmarks"),
     "msdm_core": (
         *("errors", "numba_cache", "kernels", "arithmetic", "mesh", "mesh_files", "material", "meshing", "organ"),
-        *("lanes", "cuda", "__init__"),
+        *("lanes", "__init__"),
     ),
     "surgsim_env": (
         *("step_progress", "scene", "instruments", "coupling", "palpation", "tasks", "rendering", "envs", "scripting"),

@@ -168,8 +168,8 @@ def absolute_imports(source: Source) -> Iterator[str]:
 
 
 def compiled_code_in_kernels(source: Source) -> Iterator[str]:
-    """Only kernels files import numba and compile; for a CUDA device, only what stands in msdm_core/cuda."""
-    if source.path in KERNEL_FILES or source.path.startswith("msdm_core/cuda/"):
+    """Only kernels files import numba and compile."""
+    if source.path in KERNEL_FILES:
         return
     for name, line in imported(source.tree):
         if name.split(".")[0] == "numba" and source.path not in NUMBA_SETTINGS:

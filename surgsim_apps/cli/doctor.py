@@ -26,7 +26,6 @@ from surgsim_env.scene import load_anatomy, make_scene
 FEATURES = {
     "agents": "training and scoring of agents (agents/, surgsim evaluate)",
     "bench": "other simulators in `surgsim bench`",
-    "cuda": "organs on a CUDA device (msdm_core/cuda)",
     "demonstrations": "recorded demonstrations (agents/record_demonstrations.py)",
     "distributed": "training with Ray (agents/train_rllib.py)",
     "docs": "the documentation site (make docs)",

@@ -25,7 +25,7 @@ def pressed_down(stage: dict | None):
     envs = environments(stage)
     envs.seed(3)
     envs.reset()
-    visited = envs.get_attr("unwrapped", indices=[0])[0].task.observation_slices["visited"]
+    visited = envs.get_attr("unwrapped", indices=[0])[0].observation_slices["visited"]
     rewards, felt, last = [], [], [{}] * envs.num_envs
     down = np.tile(np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32), (envs.num_envs, 1))
     for _ in range(60):

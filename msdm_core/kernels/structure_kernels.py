@@ -128,9 +128,7 @@ KEPT_FIELDS = (
     _field("node_force", "N", "n_node 3", "own", "force of the last substep, without anchors' reactions"),
     _field("spring_arm_tension", "N/m", "n_arm", "own", "relaxed tension over l0 of each arm, arm by arm"),
     _field("spring_relief", "N/m", "n_relaxing", "own", "sum_i g_i times that"),
-    _field(
-        "contact_engaged", "", "n_shape n_point", "rows", "1 for a point in contact with a shape", "uint8"
-    ),
+    _field("contact_engaged", "", "n_shape n_point", "rows", "1 for a point in contact with a shape", "uint8"),
     _field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of static friction"),
     _field("contact_passed", "", "2", "rows", "shape and triangle passed through, after such a fault", "int32"),
     _field("support_stretch", "m", "n_support_node n_support 3", "rows", "tangential stretch of static friction"),

@@ -92,7 +92,7 @@ class Arm:
         """
         from surgsim_apps.arms.find_arm import find_arm
         from surgsim_env.instruments import load_arm
-        from surgsim_env.scene import arm_toml, require_number
+        from surgsim_env.scene import as_toml, require_number
 
         if self.file.suffix.lower() == ".xacro":
             raise ValueError(f"{self.file} is a xacro file: expand it (xacro {self.file.name} > arm.urdf), check that")
@@ -122,7 +122,7 @@ class Arm:
         )
         arm = load_arm(arm_model.description)
         with output_folder(folder, names) as files:
-            (files / names[0]).write_text(arm_toml(description, head=head, comments=COMMENTS), encoding="utf-8")
+            (files / names[0]).write_text(as_toml(description, head=head, comments=COMMENTS), encoding="utf-8")
             drawn = _draw(arm, files / names[1], console)
         written = names if drawn else names[:1]
         console.print(f"written: {folder}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)

@@ -6,7 +6,7 @@ from surgsim_apps.patient.patient_scene import LAYOUT as PALPATION
 from surgsim_apps.patient.patient_scene import PatientScene
 from surgsim_apps.patient.retract_scene import LAYOUT as RETRACT
 from surgsim_apps.patient.retract_scene import RetractScene
-from surgsim_env.scene import Scene, scene_toml
+from surgsim_env.scene import Scene, as_toml
 
 SCENE_MARK = "Made by surgsim from a patient's organ."
 
@@ -53,7 +53,7 @@ def scene_text(organ: PatientScene) -> str:
         "lesion.modulus_ratio": "HCC 51, metastases 50 in 6.6 kPa liver (doi 10.1177/8756479317733713)",
         "lesion.rim_distance": "[m]",
     }
-    return scene_toml(scene, head=head, comments={**_tissue_comments(organ, scene), **comments})
+    return as_toml(scene, head=head, comments={**_tissue_comments(organ, scene), **comments})
 
 
 def retract_text(organ: PatientScene, retraction: RetractScene) -> str:
@@ -97,7 +97,7 @@ def retract_text(organ: PatientScene, retraction: RetractScene) -> str:
         "retract.camera": "[m], degrees",
     }
     scene = retraction.anatomy.scene
-    return scene_toml(scene, head=head, comments={**_tissue_comments(organ, scene), **comments})
+    return as_toml(scene, head=head, comments={**_tissue_comments(organ, scene), **comments})
 
 
 def _tissue_comments(organ: PatientScene, scene: Scene) -> dict[str, str]:

@@ -57,9 +57,6 @@ class LaneGroup:
         """Advance some of the simulations by up to `count` haptic steps, as `Simulation.control_step` does alone.
 
         Several threads may do so for several groups, because the compiled call releases the interpreter's lock.
-
-        Raises:
-            RuntimeError: one of them is being recorded.
         """
         if not self._own_rest and not all(
             simulation.organ_model is known or same_rest(simulation.organ_model, self._organs[0])

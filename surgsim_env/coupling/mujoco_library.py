@@ -4,7 +4,6 @@ Compiled code that calls a function unknown to the linker ends the process, also
 therefore check `missing` first.
 """
 
-import ctypes
 import os
 import warnings
 from functools import cache
@@ -21,8 +20,6 @@ LIBRARY_NAMES = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
 
 def load_library(folder: Path) -> str:
     """Load the library in MuJoCo's package folder into the linker; returns why it cannot be used, or ""."""
-    if not hasattr(mujoco.MjModel, "_address") or not hasattr(mujoco.MjData, "_address"):
-        return f"MuJoCo {mujoco.mj_versionString()} does not expose the addresses of its model and data"
     found = sorted(path for name in LIBRARY_NAMES for path in folder.glob(name))
     if not found:
         return f"no library of MuJoCo in {folder} ({', '.join(LIBRARY_NAMES)})"
@@ -38,11 +35,6 @@ def check_functions(names: tuple[str, ...]) -> str:
     unknown = [name for name in names if binding.address_of_symbol(name) is None]
     if unknown:
         return f"MuJoCo {mujoco.mj_versionString()} has no function {', '.join(unknown)}"
-    # Another copy of MuJoCo in the process may have another layout of its structures.
-    address = binding.address_of_symbol("mj_version")
-    version = ctypes.CFUNCTYPE(ctypes.c_int)(address)() if address else None
-    if version != mujoco.mj_version():
-        return f"the process holds another MuJoCo too: version {version}, Python's is {mujoco.mj_version()}"
     return ""
 
 

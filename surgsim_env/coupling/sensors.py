@@ -20,22 +20,13 @@ class ForceReading:
     """
 
     def __init__(self, sensor: ForceSensor, state: ArrayLike = (0.0, 0.0, 0.0)) -> None:
-        """Take the description of a sensor, and its present state (`get_state`).
-
-        Raises:
-            ValueError: another number of entries than the sensor's.
-        """
+        """Take the description of a sensor, and its present state (`get_state`)."""
         self.sensor = sensor
         values = np.array(state, dtype=np.float64)
         # One that neither drifts nor holds has a bias alone.
         self._plain = not (sensor.drift or sensor.hysteresis)
-        size = 3 if self._plain else 9
-        if values.shape == (3,):
-            values = np.concatenate([values, np.zeros(size - 3)])
-        if values.shape != (size,):
-            raise ValueError(f"bias has {values.size} entries; the rule is {size} for this sensor")
         self.bias = values[:3]
-        self.drift, self.held = (np.zeros(3), np.zeros(3)) if self._plain else (values[3:6], values[6:])
+        self.drift, self.held = (values[3:6], values[6:]) if len(values) == 9 else np.zeros((2, 3))
 
     def get_state(self) -> list[float]:
         """Bias; of a sensor with drift or hysteresis also the drift and the held force."""

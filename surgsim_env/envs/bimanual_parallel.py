@@ -67,8 +67,6 @@ class BimanualRetractParallelEnv(ParallelEnv):
             ValueError: an agent without an action, an unknown one, or an action of another shape.
             ResetNeeded: no episode is running.
         """
-        if not self.agents:
-            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset()")
         if set(actions) != set(AGENTS):
             raise ValueError(f"actions are for {sorted(actions)}; give one for each of {', '.join(AGENTS)}")
         for agent in AGENTS:

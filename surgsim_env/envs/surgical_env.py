@@ -15,7 +15,7 @@ from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.envs.saved_state import pack_state, restore_state, state_maker
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
-from surgsim_env.scene.load import fill
+from surgsim_env.scene.load import fill, require_known
 from surgsim_env.tasks.declaration import ControlStep, documentation, reward_weights
 from surgsim_env.tasks.runtime import make_runtime, setting_names
 from surgsim_env.tasks.task import Task
@@ -76,8 +76,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        if obs_mode not in OBSERVATION_MODES:
-            raise ValueError(f"obs_mode {obs_mode!r} is unknown; the modes are {', '.join(OBSERVATION_MODES)}")
+        require_known("obs_mode", obs_mode, OBSERVATION_MODES)
         kind = self.task_class
         own = {name: settings.pop(name) for name in setting_names(kind) & set(settings)}
         simulation, self.runtime = make_runtime(kind, scene, instrument, **own)

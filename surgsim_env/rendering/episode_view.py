@@ -17,6 +17,7 @@ from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import placed_endoscope
 from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import CAMERAS, render_options
+from surgsim_env.scene.load import require_known
 from surgsim_env.scene.model import Endoscope
 from surgsim_env.tasks.visibility import Disc
 
@@ -135,8 +136,8 @@ class EpisodeView:
             ValueError: an unknown mode or option, or an option's value that breaks its rule.
             NoGLError: a window is asked for and there is no display.
         """
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode {render_mode!r} is unknown; the modes are None, {', '.join(RENDER_MODES)}")
+        if render_mode is not None:
+            require_known("render_mode", render_mode, RENDER_MODES)
         if render_mode == "human" and not gl.has_display():
             raise gl.NoGLError(
                 f'render_mode "human" opens a window, and there is no display ({" and ".join(gl.DISPLAYS)} are not '

@@ -69,10 +69,6 @@ def _make_context(kind: str) -> Any:
 def no_gl_message(kind: str, error: Exception) -> str:
     """Message for a failed kind of context, with the remedy."""
     cause = f"{type(error).__name__}: {error}"
-    if kind in ("glfw", "glx"):
-        return f"no OpenGL through GLFW ({cause}): it needs a display; without one unset {VARIABLE} or set it to egl"
-    if kind == "osmesa":
-        return f"no OpenGL through OSMesa ({cause}): install libosmesa6, or set {VARIABLE}=egl"
     return (
         f"no OpenGL through {kind.upper() or 'the system'} ({cause}): pictures without a display need EGL; on Debian "
         "and Ubuntu `apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri` (no graphics card is needed), and leave "

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering.cameras import Camera, cross
+from surgsim_env.scene.load import require_known
 from surgsim_env.scene.palpable_surface import tangent_axes
 
 Range = tuple[float, float]
@@ -151,8 +152,7 @@ def find_look_ranges(split: str) -> LookRanges:
     Raises:
         ValueError: an unknown split (lists the known ones).
     """
-    if split not in LOOK_SPLITS:
-        raise ValueError(f"looks is {split!r}; it must be None, {' or '.join(map(repr, LOOK_SPLITS))}")
+    require_known("look", split, LOOK_SPLITS)
     return LOOK_SPLITS[split]
 
 

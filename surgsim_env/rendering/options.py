@@ -1,8 +1,9 @@
 """Options of pictures."""
 
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from typing import Any
+
+from surgsim_env.scene.load import nearest, require_known
 
 # Cameras of each scene.
 CAMERAS = ("overview", "endoscope", "side", "above")
@@ -46,8 +47,7 @@ class RenderOptions:
 
 def check_camera(camera: str) -> None:
     """Raise a ValueError with the known cameras if there is none of that name."""
-    if camera not in CAMERAS:
-        raise ValueError(f"camera {camera!r} is unknown; the cameras are {', '.join(CAMERAS)}")
+    require_known("camera", camera, CAMERAS)
 
 
 def render_options(arguments: dict[str, Any]) -> RenderOptions:
@@ -59,7 +59,6 @@ def render_options(arguments: dict[str, Any]) -> RenderOptions:
     known = [option.name for option in fields(RenderOptions)]
     for name in arguments:
         if name not in known:
-            nearest = get_close_matches(name, known, n=1)
-            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+            hint = nearest(name, known)
             raise ValueError(f"argument {name!r} is unknown; for pictures there are {', '.join(known)}{hint}")
     return RenderOptions(**arguments)

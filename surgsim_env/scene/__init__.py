@@ -69,7 +69,7 @@ from surgsim_env.scene.palpable_surface import (
     tangent_axes,
     warn_of_coarse_cells,
 )
-from surgsim_env.scene.save import arm_toml, scene_toml
+from surgsim_env.scene.save import as_toml
 
 __all__ = [
     "LESION_GAP",
@@ -109,7 +109,7 @@ __all__ = [
     "Vector",
     "agents_folder",
     "anatomy_of",
-    "arm_toml",
+    "as_toml",
     "contact_radius",
     "family_of",
     "fill",
@@ -127,7 +127,6 @@ __all__ = [
     "read_description",
     "read_toml",
     "require_number",
-    "scene_toml",
     "scenes_folder",
     "share_text",
     "substeps_needed",

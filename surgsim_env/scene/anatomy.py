@@ -260,11 +260,6 @@ class Anatomy:
                 break
         return centres
 
-    def surface_distance(self, point: FloatArray) -> float:
-        """Distance from a point to the free part of the organ's surface [m]."""
-        triangle, weights = self._free_surface(point)
-        return float(norm(matmul(weights, self._free_surface.corners[triangle]) - point))
-
     @cached_property
     def _free_surface(self) -> NearestTriangle:
         triangles = self.mesh.boundary_triangles

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, scenes_folder
+from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, require_known, scenes_folder
 from surgsim_env.scene.model import Vector, require_direction, require_number
 
 KINDS = ("palpator", "grasper")
@@ -215,10 +215,7 @@ def read_description(source: str | Path) -> ArmDescription:
     """
     path = Path(source)
     if path.suffix != ".toml":
-        known = list_arms()
-        if str(source) not in known:
-            hint = nearest(str(source), known)
-            raise ValueError(f"arm {str(source)!r} is unknown; the arms are {', '.join(known)}{hint}")
+        require_known("arm", str(source), list_arms())
         path = scenes_folder() / "instruments" / f"{source}.toml"
     table = read_toml(path, "arm")
     place = {"name": path.stem, "folder": path.parent}

@@ -22,7 +22,7 @@ from msdm_core.errors import MeshError
 from msdm_core.mesh.quality import radius_ratios
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.anatomy import Anatomy, MemberName
-from surgsim_env.scene.load import nearest
+from surgsim_env.scene.load import require_known
 from surgsim_env.scene.model import SPLITS, Family
 from surgsim_env.scene.palpable_surface import moved_face, tangent_axes
 
@@ -171,11 +171,6 @@ class OrganFamily:
         Raises:
             ValueError: a number beyond the split.
         """
-        if not 0 <= number < self.size:
-            raise ValueError(
-                f"scene {self.template.scene.name!r} has no member {number} in split {self.split!r}; they are numbered "
-                f"from 0 to {self.size - 1}"
-            )
         return _cached_member(self.template, MemberName(self.split, number))
 
     def draw(self, rng: np.random.Generator) -> Anatomy:
@@ -207,9 +202,8 @@ def family_of(template: Anatomy, split: str | None) -> OrganFamily | None:
     Raises:
         ValueError: a split for a scene without a family, or an unknown one.
     """
-    if split is not None and split not in SPLITS:
-        hint = nearest(str(split), list(SPLITS))
-        raise ValueError(f"split {split!r} is unknown; the splits are {', '.join(SPLITS)}{hint}")
+    if split is not None:
+        require_known("split", split, SPLITS)
     if template.scene.family is not None:
         return OrganFamily(template, split or DEFAULT_SPLIT)
     if split is not None:

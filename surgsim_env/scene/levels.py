@@ -11,7 +11,7 @@ from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Capsule, Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import make_material, nearest
+from surgsim_env.scene.load import make_material, require_known
 from surgsim_env.scene.model import LesionDraw, Range, Scene
 
 # Least gap between lesions' balls under a tip of radius REFERENCE_TIP [m], in proportion for other tips: nearer
@@ -102,22 +102,12 @@ class Level:
                 f"scene {scene.name!r} has no [lesion] table, so that level {self.name!r} has nothing to hide in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
-        shares = self._shares(draw)
-        for name, (low, high) in shares.items():
-            least = 1.0 if name == "modulus_ratio" else 0.0
-            if not low > least:
-                raise ValueError(
-                    f"level {self.name!r} of scene {scene.name!r} draws lesion.{name} from [{low:g}, {high:g}], which "
-                    f"must lie above {least:g}: narrow lesion.{name} = {list(getattr(draw, name))} of the scene"
-                )
-        return replace(draw, **shares)
+        return self.ranges(draw)
 
     def ranges(self, draw: LesionDraw) -> LesionDraw:
         """Lesion ranges with this level's shares."""
-        return replace(draw, **self._shares(draw))
-
-    def _shares(self, draw: LesionDraw) -> dict[str, tuple[float, float]]:
-        return {name: _share(getattr(draw, name), getattr(self, name)) for name in ("radius", "cover", "modulus_ratio")}
+        shared = ("radius", "cover", "modulus_ratio")
+        return replace(draw, **{name: _share(getattr(draw, name), getattr(self, name)) for name in shared})
 
     def draw(self, anatomy: Anatomy, rng: np.random.Generator, *, lesion_count: int | None = None) -> "DrawnOrgan":
         """Draw an organ.
@@ -136,8 +126,7 @@ class Level:
         capsule = 0.0
         if anatomy.scene.capsule is None and rng.random() < self.capsule_share:
             capsule = float(rng.uniform(*CAPSULE_STIFFNESS))
-        place = f"level {self.name!r} of scene {anatomy.scene.name!r}"
-        lesions = _draw_lesions(anatomy, self.lesion_draw(anatomy.scene), rng, count, background, place)
+        lesions = _draw_lesions(anatomy, self.lesion_draw(anatomy.scene), rng, count, background)
         return DrawnOrgan(lesions, background, capsule)
 
 
@@ -177,8 +166,7 @@ class DrawnOrgan:
         count = int(rng.integers(*lesion_count, endpoint=True)) if isinstance(lesion_count, tuple) else lesion_count
         if level is not None:
             return level.draw(anatomy, rng, lesion_count=count)
-        place = f"scene {anatomy.scene.name!r}"
-        return cls(_draw_lesions(anatomy, anatomy.scene.lesion, rng, count or 0, 1.0, place))
+        return cls(_draw_lesions(anatomy, anatomy.scene.lesion, rng, count or 0, 1.0))
 
     def compiled(self, anatomy: Anatomy) -> OrganModel:
         """Compile the organ on an anatomy."""
@@ -212,9 +200,9 @@ class DrawnOrgan:
 
 
 def _draw_lesions(
-    anatomy: Anatomy, ranges: LesionDraw | None, rng: np.random.Generator, count: int, background: float, place: str
+    anatomy: Anatomy, ranges: LesionDraw | None, rng: np.random.Generator, count: int, background: float
 ) -> tuple[Lesion, ...]:
-    """Draw lesions apart from each other, in tissue of a modulus factor; `place` names their origin in an error."""
+    """Draw lesions apart from each other, in tissue of a modulus factor."""
     gap = LESION_GAP * anatomy.scene.instrument.tip_radius / REFERENCE_TIP
     for _ in range(TRIES_MOST):
         lesions: list[Lesion] = []
@@ -229,8 +217,8 @@ def _draw_lesions(
         if len(lesions) == count:
             return tuple(lesions)
     raise ValueError(
-        f"{place}: {count} lesions found no room beside each other in {TRIES_MOST} draws: use smaller or fewer "
-        "lesions, or a larger palpable face"
+        f"scene {anatomy.scene.name!r}: {count} lesions found no room beside each other in {TRIES_MOST} draws: use "
+        "smaller or fewer lesions, or a larger palpable face"
     )
 
 
@@ -285,8 +273,5 @@ def find_level(name: str) -> Level:
     Raises:
         ValueError: an unknown name; lists the known ones, suggests the nearest.
     """
-    if not isinstance(name, str) or name not in LEVELS:
-        raise ValueError(
-            f"level {name!r} is unknown{nearest(str(name), list(LEVELS))}; the levels are {', '.join(LEVELS)}"
-        )
+    require_known("level", name, LEVELS)
     return LEVELS[name]

@@ -1,7 +1,7 @@
 """Scene files read into dataclasses with all entries checked; shipped scenes and arms by name."""
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -29,37 +29,20 @@ class _EntryError(dacite.DaciteFieldError):
 
 def scenes_folder() -> Path:
     """Folder with `organs/`, `instruments/` and `meshes/`; see `_shipped_folder`."""
-    return _shipped_folder(PACKAGE_FOLDER / "assets", PACKAGE_FOLDER.parent / "scenes", "organs", "scene files")
+    return _shipped_folder(PACKAGE_FOLDER / "assets", PACKAGE_FOLDER.parent / "scenes")
 
 
 def agents_folder() -> Path:
     """Folder with `policies/` and `results/` of agents; see `_shipped_folder`."""
-    agents = PACKAGE_FOLDER / "assets" / "agents"
-    return _shipped_folder(agents, PACKAGE_FOLDER.parent / "agents", "policies", "policies of agents")
+    return _shipped_folder(PACKAGE_FOLDER / "assets" / "agents", PACKAGE_FOLDER.parent / "agents")
 
 
-def _shipped_folder(packed: Path, checkout: Path, inside: str, contents: str) -> Path:
-    """Folder of shipped data.
+def _shipped_folder(packed: Path, checkout: Path) -> Path:
+    """Folder of shipped data: `packed` inside the package in a wheel, else `checkout` next to the package.
 
-    A wheel has them inside the package, a checkout next to the package. No other place is searched: an editable install
-    also leaves a copy in site-packages, which goes stale.
-
-    Args:
-        packed: its path in a wheel.
-        checkout: its path in a checkout.
-        inside: a folder inside it.
-        contents: the data, for the message.
-
-    Raises:
-        FileNotFoundError: neither exists; names both and the remedy.
+    No other place is searched: an editable install also leaves a copy in site-packages, which goes stale.
     """
-    for place in (packed, checkout):
-        if (place / inside).is_dir():
-            return place
-    raise FileNotFoundError(
-        f"surgsim's {contents} are neither in {packed} nor in {checkout} (a folder with `{inside}` in it is expected); "
-        "reinstall surgsim, or run from a complete checkout"
-    )
+    return packed if packed.is_dir() else checkout
 
 
 def read_toml(path: Path, kind: str) -> dict[str, Any]:
@@ -113,10 +96,20 @@ def _tuples_in(*hints: Any) -> Iterator[Any]:
         yield from _tuples_in(*get_args(hint))
 
 
-def nearest(name: str, known: list[str], likeness: float = 0.6) -> str:
-    """Hint at the most similar known name; empty if none has at least this likeness (0 to 1)."""
-    matches = get_close_matches(name, known, n=1, cutoff=likeness)
+def nearest(name: str, known: list[str]) -> str:
+    """Hint at the most similar known name; empty if none is similar."""
+    matches = get_close_matches(name, known, n=1)
     return f"; did you mean {matches[0]!r}?" if matches else ""
+
+
+def require_known(kind: str, name: object, known: Iterable[str]) -> None:
+    """Check a name.
+
+    Raises:
+        ValueError: an unknown name (lists the known ones, suggests the nearest).
+    """
+    if name not in (names := list(known)):
+        raise ValueError(f"{kind} {name!r} is unknown; the {kind}s are {', '.join(names)}{nearest(str(name), names)}")
 
 
 def _listed(value: Any) -> Any:
@@ -155,9 +148,7 @@ def make_scene(name: str | Path) -> Scene:
     name = str(name)
     if name.endswith(".toml"):
         return load_scene(Path(name))
-    known = list_scenes()
-    if name not in known:
-        raise ValueError(f"scene {name!r} is unknown; the scenes are {', '.join(known)}{nearest(name, known, 0.4)}")
+    require_known("scene", name, list_scenes())
     return load_scene(scenes_folder() / "organs" / f"{name}.toml")
 
 
@@ -234,12 +225,7 @@ def _material_table(name: Any, folder: Path) -> tuple[Path, dict[str, Any]]:
     if str(name).endswith(".toml"):
         path = folder / name
     else:
-        known = list_materials()
-        if name not in known:
-            raise ValueError(
-                f"material {str(name)!r} is unknown{nearest(str(name), known, 0.4)}; the materials are "
-                f"{', '.join(known)} (`surgsim materials`), or the path of a material's TOML file"
-            )
+        require_known("material", name, list_materials())
         path = scenes_folder() / "materials" / f"{name}.toml"
     return path, read_toml(path, "material")
 

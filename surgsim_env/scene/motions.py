@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
-from surgsim_env.scene.load import file_names, fill, nearest, read_toml, scenes_folder
+from surgsim_env.scene.load import file_names, fill, read_toml, require_known, scenes_folder
 from surgsim_env.scene.model import CyclicMotion, Range, Scene, Vector
 
 # Preset without motion.
@@ -83,9 +83,7 @@ def make_motion(name: str) -> MotionPreset:
     Raises:
         ValueError: an unknown name (lists the known ones, suggests the nearest).
     """
-    known = list_motions()
-    if name not in known[1:]:
-        raise ValueError(f"motion {name!r} is unknown; the motions are {', '.join(known)}{nearest(str(name), known)}")
+    require_known("motion", name, list_motions())
     path = scenes_folder() / "motions" / f"{name}.toml"
     return fill(MotionPreset, read_toml(path, "motion"), f"motion {name!r}")
 

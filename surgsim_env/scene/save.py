@@ -19,39 +19,21 @@ INLINE_TABLES = (Box, Ball, Side)
 COMMENT_COLUMN = 23
 
 
-def scene_toml(scene: Scene, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None) -> str:
-    """TOML of a scene; `scene_from_table` reads an equal one.
+def as_toml(
+    values: Scene | ArmDescription, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
+) -> str:
+    """TOML of a scene or an arm's description; `scene_from_table` or `read_description` reads an equal one.
 
     Args:
-        scene: to be written.
+        values: to be written.
         head: comment lines at the top.
         comments: texts by the path of their entry or table, such as "contact.stiffness" or "regions[0].material";
             "regions.material" is for all regions.
-
-    Raises:
-        ValueError: a field is None, unlike its default (TOML has no null).
     """
-    return _toml(scene, head, comments or {})
-
-
-def arm_toml(
-    description: ArmDescription, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
-) -> str:
-    """TOML of an arm's description; `read_description` reads an equal one.
-
-    Args:
-        description: to be written.
-        head: comment lines at the top.
-        comments: texts by the path of their entry or table, such as "trocar.point".
-    """
-    return _toml(description, head, comments or {})
-
-
-def _toml(values: Scene | ArmDescription, head: Sequence[str], comments: Mapping[str, str]) -> str:
     document = tomlkit.document()
     for line in head:
         document.add(tomlkit.comment(_printable(line)))
-    _fill(document, values, "", comments)
+    _fill(document, values, "", comments or {})
     return tomlkit.dumps(document)
 
 
@@ -64,8 +46,6 @@ def _fill(table: tomlkit.TOMLDocument | AbstractTable, values: Any, path: str, c
     for entry, value in sorted(entries, key=lambda pair: _is_table(pair[1])):
         if value in (None, (), {}) and value == _default(entry):
             continue
-        if value is None:
-            raise ValueError(f"{path}{entry.name} is None, which TOML cannot hold; its default is {_default(entry)!r}")
         table.add(entry.name, _item(entry.name, value, f"{path}{entry.name}", comments))
 
 

@@ -14,7 +14,7 @@ from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.face_frame import FaceFrame
 from surgsim_env.palpation.touches import Indenter, TouchMemory, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy
-from surgsim_env.scene.load import nearest
+from surgsim_env.scene.load import require_known
 from surgsim_env.tasks.channels import (
     CONTACT_FORCE,
     TIME_LEFT,
@@ -277,9 +277,7 @@ class PalpateTask(Task):
                 f"scene {scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
-        if frame not in FRAMES:
-            known = ", ".join(FRAMES)
-            raise ValueError(f"frame {frame!r} is unknown{nearest(frame, list(FRAMES))}; the frames are {known}")
+        require_known("frame", frame, FRAMES)
         if episode_steps is not None and episode_steps < 1:
             raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
         super().__init__(scenario)

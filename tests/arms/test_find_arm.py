@@ -20,7 +20,7 @@ from surgsim_env.instruments.arm.model import hold_joints, read_model
 from surgsim_env.instruments.arm.urdf import find_mesh
 from surgsim_env.scene.arm_description import AddedShape, LinkInertia, read_description
 from surgsim_env.scene.load import scenes_folder
-from surgsim_env.scene.save import arm_toml
+from surgsim_env.scene.save import as_toml
 
 SIX_AXIS = scenes_folder() / "instruments" / "six_axis.xml"
 # An arm with a remote centre at (0, 0, 0.3): yaw about x, pitch about y, insertion along -z, roll, and a bent wrist.
@@ -200,13 +200,13 @@ def test_what_is_coupled_to_a_driven_joint_is_held_where_it_is_at_home(scope, le
 def test_its_file_reads_back_equal(scope):
     description = find_arm(scope).description
     path = scope.parent / "scope.toml"
-    path.write_text(arm_toml(description))
+    path.write_text(as_toml(description))
     assert read_description(path) == description
 
 
 def test_it_presses_like_the_probe(scope):
     path = scope.parent / "scope.toml"
-    path.write_text(arm_toml(find_arm(scope).description))
+    path.write_text(as_toml(find_arm(scope).description))
     peaks = []
     for instrument in ("probe", str(path)):
         env: Any = gym.make("SurgSim/Palpate-v0", scene="phantom", instrument=instrument)

@@ -16,7 +16,7 @@ from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import CyclicMotion
 from surgsim_env.scene.motions import list_motions, make_motion, with_motion
-from surgsim_env.scene.save import scene_toml
+from surgsim_env.scene.save import as_toml
 from surgsim_env.scripting import Hold, oracle_script, run_script
 from surgsim_env.scripting.steps import Tracked
 
@@ -47,7 +47,7 @@ def anatomy(scene):
 @pytest.fixture(scope="module")
 def scene_file(scene, tmp_path_factory):
     path = tmp_path_factory.mktemp("scenes") / "breathing.toml"
-    path.write_text(scene_toml(scene))
+    path.write_text(as_toml(scene))
     return str(path)
 
 

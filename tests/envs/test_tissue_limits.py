@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.save import scene_toml
+from surgsim_env.scene.save import as_toml
 
 DOWN = np.array([0.0, 0.0, -1.0], dtype=np.float32)
 
@@ -15,7 +15,7 @@ DOWN = np.array([0.0, 0.0, -1.0], dtype=np.float32)
 def made(tmp_path, **limits):
     scene = make_scene("phantom_small")
     path = tmp_path / "limited.toml"
-    path.write_text(scene_toml(replace(scene, limits=replace(scene.limits, **limits))))
+    path.write_text(as_toml(replace(scene, limits=replace(scene.limits, **limits))))
     return gym.make("SurgSim/Palpate-v0", scene=str(path))
 
 

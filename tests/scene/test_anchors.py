@@ -12,7 +12,7 @@ from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_env.scene.anatomy import anatomy_of
 from surgsim_env.scene.load import make_scene, scene_from_table
 from surgsim_env.scene.model import Anchor, Ball, Box, Side
-from surgsim_env.scene.save import scene_toml
+from surgsim_env.scene.save import as_toml
 
 MESH = box_mesh((0.06, 0.05, 0.04), (6, 5, 4))
 DOWN = (0.0, 0.0, -1.0)
@@ -70,7 +70,7 @@ def test_sites_are_clear_of_what_holds_the_organ():
 
 def test_a_scene_with_elastic_tissue_is_written_and_read():
     anchors = (Anchor("fat", side=Side(DOWN, 110.0), **FAT), Anchor("a", ball=Ball((0.0, 0.0, 0.0), 0.01)))
-    text = scene_toml(replace(SCENE, anchors=anchors), comments={"anchors[0].stiffness": "[N/m^3] chosen"})
+    text = as_toml(replace(SCENE, anchors=anchors), comments={"anchors[0].stiffness": "[N/m^3] chosen"})
     assert "# [N/m^3] chosen" in text
     assert scene_from_table(tomllib.loads(text), name="a", folder=Path(".")).anchors == anchors
 

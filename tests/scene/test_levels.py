@@ -34,8 +34,8 @@ def test_draws_keep_their_ranges_and_their_distance(name: str, level: Level):
             ratio = lesion.material.youngs_modulus / (scene.material.youngs_modulus * drawn.background)
             assert radius[0] <= lesion.radius <= radius[1]
             # The cover is met to 0.1 mm.
-            assert cover[0] - 1e-4 <= anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius
-            assert anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius <= cover[1] + 1e-4
+            assert cover[0] - 1e-4 <= anatomy._free_surface.distances(np.array(lesion.centre)[None])[0] - lesion.radius
+            assert anatomy._free_surface.distances(np.array(lesion.centre)[None])[0] - lesion.radius <= cover[1] + 1e-4
             least, most = shares(scene.lesion.modulus_ratio, level.modulus_ratio)
             assert least * (1 - 1e-12) <= ratio <= most * (1 + 1e-12)
             for other in drawn.lesions[:index]:

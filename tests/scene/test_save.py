@@ -15,7 +15,7 @@ from msdm_core.material.stiffness import STIFFNESS_RULES
 from msdm_core.organ.support import SIZES, Support
 from surgsim_env.scene.load import list_scenes, make_scene, scene_from_table
 from surgsim_env.scene.model import Anchor, Flap, Limits, Material, MeshSource, Retraction, Scene
-from surgsim_env.scene.save import scene_toml
+from surgsim_env.scene.save import as_toml
 
 NUMBERS = st.floats(1e-9, 1.0, exclude_max=True)
 # Ranges of fields that a rule of their own holds; every other field goes by its type alone.
@@ -92,19 +92,19 @@ def read(text, like):
 )
 @given(instances(Scene))
 def test_a_scene_that_is_written_is_read_as_an_equal_one(scene):
-    assert read(scene_toml(scene), scene) == scene
+    assert read(as_toml(scene), scene) == scene
 
 
 @pytest.mark.parametrize("name", list_scenes())
 def test_shipped_scenes_are_written_and_read(name):
     scene = make_scene(name)
-    assert read(scene_toml(scene), scene) == scene
+    assert read(as_toml(scene), scene) == scene
 
 
 def test_comments_stand_at_their_entries():
     scene = replace(make_scene("lobe"), description="x")
     comments = {"contact": "all\nof it", "contact.friction": "low", "ports": "both", "ports[1].into": "right only"}
-    text = scene_toml(scene, head=["first", "second"], comments=comments)
+    text = as_toml(scene, head=["first", "second"], comments=comments)
     assert text.startswith("# first\n# second\ndescription")
     assert "[contact]              # all of it\n" in text
     assert "friction = 0.2         # low\n" in text

@@ -63,7 +63,10 @@ def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
     hardest = replace(anatomy, scene=replace(scene, lesion=extreme))
     for _ in range(12):
         lesion = hardest.random_lesion(rng)
-        assert anatomy.surface_distance(np.array(lesion.centre)) >= draw.radius[1] + draw.cover[0] - 1.01e-4
+        assert (
+            anatomy._free_surface.distances(np.array(lesion.centre)[None])[0]
+            >= draw.radius[1] + draw.cover[0] - 1.01e-4
+        )
         worst = min(worst, stable_dt(anatomy.organ([lesion]), scene.contact.law))
     assert substeps_needed(scene.timing.haptic_step, worst) <= scene.timing.substep_count
 
@@ -181,6 +184,6 @@ def test_every_draw_finds_room_and_keeps_its_ranges(name):
     draw = anatomy.scene.lesion
     for seed in range(150):
         lesion = anatomy.random_lesion(np.random.default_rng(seed))
-        cover = anatomy.surface_distance(np.array(lesion.centre)) - lesion.radius
+        cover = anatomy._free_surface.distances(np.array(lesion.centre)[None])[0] - lesion.radius
         assert draw.radius[0] <= lesion.radius <= draw.radius[1]
         assert draw.cover[0] - 1.01e-4 <= cover <= draw.cover[1] + 1.01e-4

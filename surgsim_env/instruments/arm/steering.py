@@ -170,10 +170,9 @@ class SteeredArm:
         """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.
 
         Raises:
-            ValueError: no jaw, or a target outside that range.
+            ValueError: a target outside that range.
         """
-        if self.jaw is None:
-            raise ValueError(f"{self.where} has no jaw: it carries a {self.arm.description.kind}")
+        assert self.jaw is not None
         self.jaw.command(target)
 
     def get_state(self) -> FloatArray:

@@ -102,12 +102,22 @@ class Level:
                 f"scene {scene.name!r} has no [lesion] table, so that level {self.name!r} has nothing to hide in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
-        return self.ranges(draw)
+        shares = self._shares(draw)
+        for name, (low, high) in shares.items():
+            least = 1.0 if name == "modulus_ratio" else 0.0
+            if not low > least:
+                raise ValueError(
+                    f"level {self.name!r} of scene {scene.name!r} draws lesion.{name} from [{low:g}, {high:g}], which "
+                    f"must lie above {least:g}: narrow lesion.{name} = {list(getattr(draw, name))} of the scene"
+                )
+        return replace(draw, **shares)
 
     def ranges(self, draw: LesionDraw) -> LesionDraw:
         """Lesion ranges with this level's shares."""
-        shared = ("radius", "cover", "modulus_ratio")
-        return replace(draw, **{name: _share(getattr(draw, name), getattr(self, name)) for name in shared})
+        return replace(draw, **self._shares(draw))
+
+    def _shares(self, draw: LesionDraw) -> dict[str, tuple[float, float]]:
+        return {name: _share(getattr(draw, name), getattr(self, name)) for name in ("radius", "cover", "modulus_ratio")}
 
     def draw(self, anatomy: Anatomy, rng: np.random.Generator, *, lesion_count: int | None = None) -> "DrawnOrgan":
         """Draw an organ.

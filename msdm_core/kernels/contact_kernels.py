@@ -12,6 +12,7 @@ from msdm_core.kernels.space_kernels import (
     edge,
     length_of,
     minus,
+    opposite,
     part_of_row,
     plus,
     row_of,
@@ -360,7 +361,7 @@ def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, 
     item = places[number, 1]
     point = item % QUADRATURE_COUNT
     rate = -rows[number, ROW_TOOL]
-    across = times(-1.0, part_of_row(rows, number, ROW_TOOL + 1))
+    across = opposite(part_of_row(rows, number, ROW_TOOL + 1))
     for corner in range(3):
         node = places[number, 2 + corner]
         after = shifted(times(decay, row_of(velocity, node)), dt * inverse_mass[node], row_of(force, node))
@@ -380,9 +381,9 @@ def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, 
     longest = law.friction * shapes.shape_friction[shape] * (pressure + more) / law.tangential_stiffness
     kept = slipped(stretch, longest)
     stretch = times(kept, stretch)
-    step = minus(stretch, last)
-    set_row(rows, number, ROW_STEP + 1, step)
-    set_row(rows, number, ROW_MORE + 1, plus(added, step))
+    set_row(rows, number, ROW_STEP + 1, minus(stretch, last))
+    # The step as the row holds it, which may be in float32.
+    set_row(rows, number, ROW_MORE + 1, plus(added, part_of_row(rows, number, ROW_STEP + 1)))
     if kept < 1.0 and sweep == len(SWEEPS) - 1:
         set_row(stretch_memory[shape], item, 0, stretch)
 
@@ -582,7 +583,7 @@ def _without_core(shapes, shape, near, slope):
 def lag_point(position, surface, stretch, shapes, response, shape, triangle, point):
     """Shift the stretch of a point by its tool's lag."""
     tool, item = shapes.shape_tool[shape], triangle * QUADRATURE_COUNT + point
-    offset = times(-1.0, row_of(shapes.tool_centre, tool))
+    offset = opposite(row_of(shapes.tool_centre, tool))
     for corner in range(3):
         offset = shifted(offset, QUADRATURE_BARYCENTRIC[point, corner], row_of(position, surface[triangle, corner]))
     take_from_row(stretch[shape], item, 0, rigid_velocity(response.tool_lag, tool, offset))

@@ -62,6 +62,12 @@ def minus(a, b):
 
 
 @njit(**INLINED)
+def opposite(a):
+    """Vector -a, of the type of a."""
+    return -a[0], -a[1], -a[2]
+
+
+@njit(**INLINED)
 def times(number, a):
     """Product of a number and a vector."""
     return number * a[0], number * a[1], number * a[2]

@@ -23,7 +23,16 @@ from msdm_core.kernels.layout_kernels import (
     take_from_node,
 )
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
-from msdm_core.kernels.space_kernels import divided, edge, plus, scalar_product, shifted, times, vector_product
+from msdm_core.kernels.space_kernels import (
+    divided,
+    edge,
+    opposite,
+    plus,
+    scalar_product,
+    shifted,
+    times,
+    vector_product,
+)
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 # Implicit stiffness of a steep spring over the rise of its tangent: a larger factor needs fewer sweeps for the fast
@@ -68,7 +77,7 @@ def hold_squeezed(
             if not ratio < SQUEEZED_RATIO:
                 continue
             gc, gd = vector_product(d, b), vector_product(b, c)
-            ga = times(-1.0, plus(plus(gb, gc), gd))
+            ga = opposite(plus(plus(gb, gc), gd))
             gradients = (ga, gb, gc, gd)
             # Six times the rate of the volume after all forces so far, and its change for a tension of 6.
             six_rate = 0.0

@@ -5,8 +5,24 @@ import math
 import numpy as np
 from numba import njit
 
-from msdm_core.kernels.element_kernels import corner_gradient, edge
-from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
+from msdm_core.kernels.option_kernels import INLINED, INNER
+from msdm_core.kernels.space_kernels import (
+    add_to_row,
+    divided,
+    edge,
+    length_of,
+    minus,
+    opposite,
+    part_of_row,
+    plus,
+    row_of,
+    scalar_product,
+    set_row,
+    shifted,
+    take_from_row,
+    times,
+    vector_product,
+)
 
 # Margin for the motion of tissue towards a shape between two broad phases [m]: 1 mm in a haptic step of 1 ms is 1 m/s.
 CANDIDATE_MARGIN = 1e-3
@@ -51,31 +67,27 @@ def reach_margin(shapes, shape, duration):
 
 
 @njit(**INLINED)
-def core_box(ends, spans, shape, around):
-    """Lowest and highest x, y and z of the core of a shape, widened by `around` [m]: six numbers."""
-    low_x, high_x = _extent(ends, spans, shape, 0, around)
-    low_y, high_y = _extent(ends, spans, shape, 1, around)
-    low_z, high_z = _extent(ends, spans, shape, 2, around)
-    return low_x, high_x, low_y, high_y, low_z, high_z
+def core_box(shapes, shape, margin):
+    """Lowest and highest x, y and z of a shape, widened by a margin [m]."""
+    around = shapes.shape_radius[shape] + margin
+    return _extent(shapes, shape, 0, around), _extent(shapes, shape, 1, around), _extent(shapes, shape, 2, around)
 
 
 @njit(**INLINED)
-def is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
+def is_in_reach(position, surface, engaged, shapes, shape, triangle, margin, box):
     """True if a shape may touch a triangle, by `core_box` and spheres, or is in contact with it."""
-    a = surface[triangle, 0]
-    b = surface[triangle, 1]
-    c = surface[triangle, 2]
+    corners = row_of(surface, triangle)
     # Cheap first: box against box; then the sphere around the triangle against the axis.
     near = (
-        _overlap(position, 0, a, b, c, box[0], box[1])
-        and _overlap(position, 1, a, b, c, box[2], box[3])
-        and _overlap(position, 2, a, b, c, box[4], box[5])
+        _overlap(position, 0, corners, box[0])
+        and _overlap(position, 1, corners, box[1])
+        and _overlap(position, 2, corners, box[2])
     )
     if near:
-        x, y, z, size_squared = _middle(position, a, b, c)
-        px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-        limit = math.sqrt(size_squared) + radius + margin
-        near = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 <= limit * limit
+        middle, size_squared = _middle(position, corners)
+        away = minus(middle, closest_on_core(shapes, shape, middle))
+        limit = math.sqrt(size_squared) + shapes.shape_radius[shape] + margin
+        near = scalar_product(away, away) <= limit * limit
     return near or _is_held(engaged, shape, triangle)
 
 
@@ -91,16 +103,15 @@ def find_candidates(model, state, shapes, duration):
     Out:   state: contact_candidates, a row for each shape, ended by -1 (n_shape, n_surface)
     Returns the largest number of candidates of a shape.
     """
-    # Arrays are read from the structures before the loops: inside, each access would cost a reference count.
-    position, ends, spans, surface = state.node_position, shapes.shape_ends, shapes.shape_span, model.surface_triangles
+    position, surface = state.node_position, model.surface_triangles
     engaged, candidates = state.contact_engaged, state.contact_candidates
     most = 0
     for shape in range(shapes.shape_radius.shape[0]):
-        radius, margin = shapes.shape_radius[shape], reach_margin(shapes, shape, duration)
-        box = core_box(ends, spans, shape, radius + margin)
+        margin = reach_margin(shapes, shape, duration)
+        box = core_box(shapes, shape, margin)
         count = 0
         for triangle in range(surface.shape[0]):
-            if is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
+            if is_in_reach(position, surface, engaged, shapes, shape, triangle, margin, box):
                 candidates[shape, count] = triangle
                 count += 1
         if count < candidates.shape[1]:
@@ -110,62 +121,49 @@ def find_candidates(model, state, shapes, duration):
 
 
 @njit(**INLINED)
-def stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz):
-    """Stretch of a tangential spring in static friction: u + dt v, without its part along the normal n.
+def stretched(stretch, velocity, dt, normal):
+    """Stretch of a tangential spring in static friction: u + dt v, without its part along the normal n [m].
 
-    In: u: stretch before [m], v: relative velocity [m/s], dt [s], n: unit normal
-    Returns u [m], three numbers.
+    In: stretch: before [m], velocity: relative [m/s], dt [s], normal: of length 1
     """
-    ux += dt * vx
-    uy += dt * vy
-    uz += dt * vz
-    along = ux * nx + uy * ny + uz * nz
-    return ux - along * nx, uy - along * ny, uz - along * nz
+    stretch = shifted(stretch, dt, velocity)
+    return minus(stretch, times(scalar_product(stretch, normal), normal))
 
 
 @njit(**INLINED)
-def slipped(ux, uy, uz, longest):
-    """Factor on a stretch u [m] for slip at a length above `longest` = mu p / k_t [m] (Coulomb); at most 1."""
-    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+def slipped(stretch, longest):
+    """Factor on a stretch [m] for slip at a length above `longest` = mu p / k_t [m] (Coulomb); at most 1."""
+    length = length_of(stretch)
     return longest / length if length > longest else 1.0
 
 
 @njit(**INLINED)
-def stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, longest):
+def stick_or_slip(stretch, velocity, dt, normal, longest):
     """`stretched`, then shortened to `longest` [m] by slip."""
-    ux, uy, uz = stretched(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz)
-    kept = slipped(ux, uy, uz, longest)
-    return kept * ux, kept * uy, kept * uz
+    stretch = stretched(stretch, velocity, dt, normal)
+    return times(slipped(stretch, longest), stretch)
 
 
 @njit(**INLINED)
-def may_meet(position, surface, engaged, ends, spans, shape, triangle, radius):
+def may_meet(position, surface, engaged, shapes, shape, triangle):
     """True if a shape is in contact with a triangle, or may contain one of its points now."""
     if _is_held(engaged, shape, triangle):
         return True
     # Quadrature points lie within half of that radius around the middle.
-    a, b, c = surface[triangle, 0], surface[triangle, 1], surface[triangle, 2]
-    x, y, z, size_squared = _middle(position, a, b, c)
-    px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-    limit = 0.5 * math.sqrt(size_squared) + radius
-    return not (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2 > limit * limit
+    middle, size_squared = _middle(position, row_of(surface, triangle))
+    away = minus(middle, closest_on_core(shapes, shape, middle))
+    limit = 0.5 * math.sqrt(size_squared) + shapes.shape_radius[shape]
+    return not scalar_product(away, away) > limit * limit
 
 
 @njit(**INLINED)
 def facet_of(position, surface, triangle):
-    """Nodes of a triangle, edges from its first corner [m], unit normal, twice its area [m^2]: 13 numbers."""
-    a = surface[triangle, 0]
-    b = surface[triangle, 1]
-    c = surface[triangle, 2]
-    b_edge, c_edge = edge(position, a, b), edge(position, a, c)
-    bx, by, bz = b_edge
-    cx, cy, cz = c_edge
-    nx, ny, nz = corner_gradient(b_edge, c_edge)
-    twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
-    nx /= twice_area
-    ny /= twice_area
-    nz /= twice_area
-    return a, b, c, bx, by, bz, cx, cy, cz, nx, ny, nz, twice_area
+    """Nodes of a triangle, edges from its first corner to the others [m], unit normal, twice its area [m^2]."""
+    corners = row_of(surface, triangle)
+    b, c = edge(position, corners[0], corners[1]), edge(position, corners[0], corners[2])
+    normal = vector_product(b, c)
+    twice_area = length_of(normal)
+    return corners, b, c, divided(normal, twice_area), twice_area
 
 
 @njit(**INLINED)
@@ -178,22 +176,18 @@ def press_point(
     Out: engaged, stretch_memory: of the point; `row` of rows and places, if it is engaged
     Returns True if it is engaged.
     """
-    a, b, c, bx, by, bz, cx, cy, cz, nx, ny, nz, twice_area = facet
-    ends, spans, centre, twist = shapes.shape_ends, shapes.shape_span, shapes.tool_centre, shapes.tool_twist
+    corners, b, c, normal, twice_area = facet
     tool, radius = shapes.shape_tool[shape], shapes.shape_radius[shape]
     friction = law.friction * shapes.shape_friction[shape]
     weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
     item = triangle * QUADRATURE_COUNT + point
-    wa = QUADRATURE_BARYCENTRIC[point, 0]
-    wb = QUADRATURE_BARYCENTRIC[point, 1]
-    wc = QUADRATURE_BARYCENTRIC[point, 2]
-    x, y, z = _mean(position, a, b, c, wa, wb, wc)
-    px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-    t = (x - px) * nx + (y - py) * ny + (z - pz) * nz
-    rx = x - px - t * nx
-    ry = y - py - t * ny
-    rz = z - pz - t * nz
-    chord_squared = radius * radius - (rx * rx + ry * ry + rz * rz)
+    weights = row_of(QUADRATURE_BARYCENTRIC, point)
+    place = _mean(position, corners, weights)
+    near = closest_on_core(shapes, shape, place)
+    away = minus(place, near)
+    t = scalar_product(away, normal)
+    across = minus(away, times(t, normal))
+    chord_squared = radius * radius - scalar_product(across, across)
     if chord_squared <= 0.0:
         _release(engaged, stretch_memory, shape, item)
         return False
@@ -203,71 +197,53 @@ def press_point(
         _release(engaged, stretch_memory, shape, item)
         return False
     engaged[shape, item] = 1
-    # e: unit vector against the ball's own normal at the exit of the line along n.
-    ex = (s * nx - rx) / radius
-    ey = (s * ny - ry) / radius
-    ez = (s * nz - rz) / radius
+    # Unit vector against the ball's own normal at the exit of the line along n.
+    out = divided(minus(times(s, normal), across), radius)
     pressure = law.stiffness * s * depth / radius
 
     # Slope of g at the point: (s^2 n - (2 s + t) rho) / (s r), without the directions along the core.
     scale = 1.0 / (s * radius)
-    gx = scale * (chord_squared * nx - (2.0 * s + t) * rx)
-    gy = scale * (chord_squared * ny - (2.0 * s + t) * ry)
-    gz = scale * (chord_squared * nz - (2.0 * s + t) * rz)
-    gx, gy, gz = _without_core(ends, spans, shape, px, py, pz, gx, gy, gz)
+    slope = times(scale, minus(times(chord_squared, normal), times(2.0 * s + t, across)))
+    slope = _without_core(shapes, shape, near, slope)
 
     # Rotation of the normal with the corners: dn = -sum grad(lambda_a) (n . dx_a); its share of the slope
     # is along n. rho . grad(lambda_b) = rho . (c x n) / (2 A), for the corner c rho . (n x b) / (2 A).
-    turn_b = (rx * (cy * nz - cz * ny) + ry * (cz * nx - cx * nz) + rz * (cx * ny - cy * nx)) / twice_area
-    turn_c = (rx * (ny * bz - nz * by) + ry * (nz * bx - nx * bz) + rz * (nx * by - ny * bx)) / twice_area
+    turn_b = scalar_product(across, vector_product(c, normal)) / twice_area
+    turn_c = scalar_product(across, vector_product(normal, b)) / twice_area
     turn = -scale * depth * depth
     tb = turn * turn_b
     tc = turn * turn_c
 
     # Friction: a tangential spring moving with the surface and turning with the tool.
-    ux = stretch_memory[shape, item, 0]
-    uy = stretch_memory[shape, item, 1]
-    uz = stretch_memory[shape, item, 2]
-    vx, vy, vz = _mean(velocity, a, b, c, wa, wb, wc)
-    ox, oy, oz = tool_velocity(twist, centre, tool, x, y, z)
-    vx += twist[tool, 4] * uz - twist[tool, 5] * uy - ox
-    vy += twist[tool, 5] * ux - twist[tool, 3] * uz - oy
-    vz += twist[tool, 3] * uy - twist[tool, 4] * ux - oz
+    stretch = row_of(stretch_memory[shape], item)
+    turning = vector_product(part_of_row(shapes.tool_twist, tool, 3), stretch)
+    relative = plus(_mean(velocity, corners, weights), minus(turning, tool_velocity(shapes, tool, place)))
     longest = friction * pressure / law.tangential_stiffness
-    ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, ex, ey, ez, longest)
-    stretch_memory[shape, item, 0] = ux
-    stretch_memory[shape, item, 1] = uy
-    stretch_memory[shape, item, 2] = uz
+    stretch = stick_or_slip(stretch, relative, dt, out, longest)
+    set_row(stretch_memory[shape], item, 0, stretch)
 
     places[row, 0] = shape
     places[row, 1] = item
-    places[row, 2] = a
-    places[row, 3] = b
-    places[row, 4] = c
-    _put_slope(rows, row, 0, wa, -tb - tc, gx, gy, gz, nx, ny, nz)
-    _put_slope(rows, row, 1, wb, tb, gx, gy, gz, nx, ny, nz)
-    _put_slope(rows, row, 2, wc, tc, gx, gy, gz, nx, ny, nz)
-    steepness = math.sqrt(gx * gx + gy * gy + gz * gz)
-    rows[row, ROW_NORM] = wa * steepness + abs(tb + tc)
-    rows[row, ROW_NORM + 1] = wb * steepness + abs(tb)
-    rows[row, ROW_NORM + 2] = wc * steepness + abs(tc)
+    set_row(places, row, 2, corners)
+    wa, wb, wc = weights
+    set_row(rows, row, ROW_SLOPE, shifted(times(wa, slope), -tb - tc, normal))
+    set_row(rows, row, ROW_SLOPE + 3, shifted(times(wb, slope), tb, normal))
+    set_row(rows, row, ROW_SLOPE + 6, shifted(times(wc, slope), tc, normal))
+    steepness = length_of(slope)
+    norms = (wa * steepness + abs(tb + tc), wb * steepness + abs(tb), wc * steepness + abs(tc))
+    set_row(rows, row, ROW_NORM, norms)
     rows[row, ROW_AREA] = weighted_area
     rows[row, ROW_PRESSURE] = pressure
-    rows[row, ROW_OUT] = ex
-    rows[row, ROW_OUT + 1] = ey
-    rows[row, ROW_OUT + 2] = ez
-    rows[row, ROW_STRETCH] = ux
-    rows[row, ROW_STRETCH + 1] = uy
-    rows[row, ROW_STRETCH + 2] = uz
+    set_row(rows, row, ROW_OUT, out)
+    set_row(rows, row, ROW_STRETCH, stretch)
     return True
 
 
 @njit(**INLINED)
 def first_push(rows, row, law):
     """Pressure times area of a point [N] and its friction force [N], from `press_point`."""
-    drag = rows[row, ROW_AREA] * law.tangential_stiffness
-    ux, uy, uz = rows[row, ROW_STRETCH] * drag, rows[row, ROW_STRETCH + 1] * drag, rows[row, ROW_STRETCH + 2] * drag
-    return rows[row, ROW_AREA] * rows[row, ROW_PRESSURE], ux, uy, uz
+    drag = times(rows[row, ROW_AREA] * law.tangential_stiffness, part_of_row(rows, row, ROW_STRETCH))
+    return rows[row, ROW_AREA] * rows[row, ROW_PRESSURE], drag
 
 
 @njit(**INNER)
@@ -295,7 +271,6 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
     engaged, stretch_memory, candidates = state.contact_engaged, state.contact_stretch, state.contact_candidates
     rows, places = state.contact_rows, state.contact_places
     surface, rest_area = model.surface_triangles, model.surface_rest_area
-    ends, spans = shapes.shape_ends, shapes.shape_span
     count = 0
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
@@ -303,7 +278,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
             triangle = candidates[shape, entry]
             if triangle < 0:
                 break
-            if not may_meet(position, surface, engaged, ends, spans, shape, triangle, shapes.shape_radius[shape]):
+            if not may_meet(position, surface, engaged, shapes, shape, triangle):
                 continue
             facet = facet_of(position, surface, triangle)
             for point in range(QUADRATURE_COUNT):
@@ -312,12 +287,12 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                     triangle, facet, point, count,
                 ):  # fmt: skip
                     continue
-                push, ux, uy, uz = first_push(rows, count, law)
+                push, drag = first_push(rows, count, law)
                 # A loop: unrolled by hand, the call would be compiled for each constant corner.
                 for corner in range(3):
                     node, weight = places[count, 2 + corner], QUADRATURE_BARYCENTRIC[point, corner]
                     _push_corner(
-                        position, force, reference, wrench, tool, node, rows, count, corner, push, weight, ux, uy, uz
+                        position, force, reference, wrench, tool, node, rows, count, corner, push, weight, drag
                     )
                 count += 1
     return count
@@ -344,30 +319,18 @@ def hold_share(rows, number, corner, weight, along, across, dt):
 @njit(**INLINED)
 def begin_hold(position, shapes, rows, places, number):
     """Start of a point's hold: tool speed along its slopes and at the point, no change of pressure and stretch yet."""
-    centre, twist = shapes.tool_centre, shapes.tool_twist
     point = places[number, 1] % QUADRATURE_COUNT
     tool = shapes.shape_tool[places[number, 0]]
-    ux = rows[number, ROW_STRETCH]
-    uy = rows[number, ROW_STRETCH + 1]
-    uz = rows[number, ROW_STRETCH + 2]
+    stretch = part_of_row(rows, number, ROW_STRETCH)
     # The stretch turns with the tool.
-    vx = twist[tool, 5] * uy - twist[tool, 4] * uz
-    vy = twist[tool, 3] * uz - twist[tool, 5] * ux
-    vz = twist[tool, 4] * ux - twist[tool, 3] * uy
-    rate = ux * 0.0
+    across = vector_product(stretch, part_of_row(shapes.tool_twist, tool, 3))
+    rate = stretch[0] * 0.0
     for corner in range(3):
-        node = places[number, 2 + corner]
-        weight = QUADRATURE_BARYCENTRIC[point, corner]
-        ox, oy, oz = tool_velocity(twist, centre, tool, position[node, 0], position[node, 1], position[node, 2])
-        slope = ROW_SLOPE + 3 * corner
-        rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
-        vx += weight * ox
-        vy += weight * oy
-        vz += weight * oz
+        velocity = tool_velocity(shapes, tool, row_of(position, places[number, 2 + corner]))
+        rate += scalar_product(part_of_row(rows, number, ROW_SLOPE + 3 * corner), velocity)
+        across = shifted(across, QUADRATURE_BARYCENTRIC[point, corner], velocity)
     rows[number, ROW_TOOL] = rate
-    rows[number, ROW_TOOL + 1] = vx
-    rows[number, ROW_TOOL + 2] = vy
-    rows[number, ROW_TOOL + 3] = vz
+    set_row(rows, number, ROW_TOOL + 1, across)
     for part in range(4):
         rows[number, ROW_MORE + part] = 0.0
 
@@ -398,21 +361,12 @@ def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, 
     item = places[number, 1]
     point = item % QUADRATURE_COUNT
     rate = -rows[number, ROW_TOOL]
-    vx = -rows[number, ROW_TOOL + 1]
-    vy = -rows[number, ROW_TOOL + 2]
-    vz = -rows[number, ROW_TOOL + 3]
+    across = opposite(part_of_row(rows, number, ROW_TOOL + 1))
     for corner in range(3):
         node = places[number, 2 + corner]
-        weight = QUADRATURE_BARYCENTRIC[point, corner]
-        gain = dt * inverse_mass[node]
-        ox = decay * velocity[node, 0] + gain * force[node, 0]
-        oy = decay * velocity[node, 1] + gain * force[node, 1]
-        oz = decay * velocity[node, 2] + gain * force[node, 2]
-        slope = ROW_SLOPE + 3 * corner
-        rate += rows[number, slope] * ox + rows[number, slope + 1] * oy + rows[number, slope + 2] * oz
-        vx += weight * ox
-        vy += weight * oy
-        vz += weight * oz
+        after = shifted(times(decay, row_of(velocity, node)), dt * inverse_mass[node], row_of(force, node))
+        rate += scalar_product(part_of_row(rows, number, ROW_SLOPE + 3 * corner), after)
+        across = shifted(across, QUADRATURE_BARYCENTRIC[point, corner], after)
     pressure = rows[number, ROW_PRESSURE]
     before = rows[number, ROW_MORE]
     more = before + SWEEPS[sweep] * rows[number, ROW_GIVE] * (along * rate - before)
@@ -420,37 +374,25 @@ def sweep_point(velocity, force, inverse_mass, stretch_memory, shapes, law, dt, 
     rows[number, ROW_MORE] = more
     rows[number, ROW_STEP] = more - before
     # From the stretch of the last sweep towards that of the velocities.
-    ux = rows[number, ROW_STRETCH] + rows[number, ROW_MORE + 1]
-    uy = rows[number, ROW_STRETCH + 1] + rows[number, ROW_MORE + 2]
-    uz = rows[number, ROW_STRETCH + 2] + rows[number, ROW_MORE + 3]
+    added = part_of_row(rows, number, ROW_MORE + 1)
+    last = plus(part_of_row(rows, number, ROW_STRETCH), added)
     give = SWEEPS[sweep] * rows[number, ROW_GIVE + 1]
-    qx, qy, qz = stretched(
-        ux, uy, uz, dt * vx - rows[number, ROW_MORE + 1], dt * vy - rows[number, ROW_MORE + 2],
-        dt * vz - rows[number, ROW_MORE + 3], give,
-        rows[number, ROW_OUT], rows[number, ROW_OUT + 1], rows[number, ROW_OUT + 2],
-    )  # fmt: skip
+    stretch = stretched(last, minus(times(dt, across), added), give, part_of_row(rows, number, ROW_OUT))
     longest = law.friction * shapes.shape_friction[shape] * (pressure + more) / law.tangential_stiffness
-    kept = slipped(qx, qy, qz, longest)
-    qx *= kept
-    qy *= kept
-    qz *= kept
-    rows[number, ROW_STEP + 1] = qx - ux
-    rows[number, ROW_STEP + 2] = qy - uy
-    rows[number, ROW_STEP + 3] = qz - uz
-    for part in range(1, 4):
-        rows[number, ROW_MORE + part] += rows[number, ROW_STEP + part]
+    kept = slipped(stretch, longest)
+    stretch = times(kept, stretch)
+    set_row(rows, number, ROW_STEP + 1, minus(stretch, last))
+    # The step as the row holds it, which may be in float32.
+    set_row(rows, number, ROW_MORE + 1, plus(added, part_of_row(rows, number, ROW_STEP + 1)))
     if kept < 1.0 and sweep == len(SWEEPS) - 1:
-        stretch_memory[shape, item, 0] = qx
-        stretch_memory[shape, item, 1] = qy
-        stretch_memory[shape, item, 2] = qz
+        set_row(stretch_memory[shape], item, 0, stretch)
 
 
 @njit(**INLINED)
 def more_push(rows, number, law):
     """Change in the last sweep: pressure times area [N] and friction force [N]."""
-    push = rows[number, ROW_AREA] * rows[number, ROW_STEP]
-    drag = rows[number, ROW_AREA] * law.tangential_stiffness
-    return push, drag * rows[number, ROW_STEP + 1], drag * rows[number, ROW_STEP + 2], drag * rows[number, ROW_STEP + 3]
+    drag = times(rows[number, ROW_AREA] * law.tangential_stiffness, part_of_row(rows, number, ROW_STEP + 1))
+    return rows[number, ROW_AREA] * rows[number, ROW_STEP], drag
 
 
 @njit(**INNER)
@@ -496,62 +438,60 @@ def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wre
         for number in range(row_count):
             point = places[number, 1] % QUADRATURE_COUNT
             tool = shapes.shape_tool[places[number, 0]]
-            push, ux, uy, uz = more_push(rows, number, law)
+            push, drag = more_push(rows, number, law)
             for corner in range(3):
                 node = places[number, 2 + corner]
                 weight = QUADRATURE_BARYCENTRIC[point, corner]
-                _push_corner(
-                    position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz
-                )
+                _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, drag)
                 hold[node] = 0.0
 
 
 @njit(**INLINED)
-def _extent(ends, spans, shape, axis, around):
+def _extent(shapes, shape, axis, around):
     """Lowest and highest coordinate of the core of a shape, widened by `around` [m]."""
-    first, second = ends[shape, 0, axis], ends[shape, 1, axis]
-    around += abs(spans[shape, axis])
+    first, second = shapes.shape_ends[shape, 0, axis], shapes.shape_ends[shape, 1, axis]
+    around += abs(shapes.shape_span[shape, axis])
     return min(first, second) - around, max(first, second) + around
 
 
 @njit(**INLINED)
-def _overlap(position, axis, a, b, c, low, high):
+def _overlap(position, axis, corners, interval):
     """True if a triangle reaches into an interval of one coordinate."""
-    first, second, third = position[a, axis], position[b, axis], position[c, axis]
-    return max(first, second, third) >= low and min(first, second, third) <= high
+    first, second, third = position[corners[0], axis], position[corners[1], axis], position[corners[2], axis]
+    return max(first, second, third) >= interval[0] and min(first, second, third) <= interval[1]
 
 
 @njit(**INLINED)
-def _mean(values, a, b, c, wa, wb, wc):
+def _mean(values, nodes, weights):
     """Weighted mean of three nodes' values."""
-    x = wa * values[a, 0] + wb * values[b, 0] + wc * values[c, 0]
-    y = wa * values[a, 1] + wb * values[b, 1] + wc * values[c, 1]
-    z = wa * values[a, 2] + wb * values[b, 2] + wc * values[c, 2]
-    return x, y, z
+    part = shifted(times(weights[0], row_of(values, nodes[0])), weights[1], row_of(values, nodes[1]))
+    return shifted(part, weights[2], row_of(values, nodes[2]))
 
 
 @njit(**INLINED)
-def tool_velocity(twist, centre, tool, x, y, z):
+def rigid_velocity(twist, tool, offset):
+    """Velocity v + w x r [m/s] at an offset r [m] from a centre of mass, of twists (n_tool, 6) [m/s, rad/s]."""
+    x, y, z = offset
+    return (
+        twist[tool, 0] + twist[tool, 4] * z - twist[tool, 5] * y,
+        twist[tool, 1] + twist[tool, 5] * x - twist[tool, 3] * z,
+        twist[tool, 2] + twist[tool, 3] * y - twist[tool, 4] * x,
+    )
+
+
+@njit(**INLINED)
+def tool_velocity(shapes, tool, point):
     """Velocity of a tool at a point [m/s]."""
-    ox = x - centre[tool, 0]
-    oy = y - centre[tool, 1]
-    oz = z - centre[tool, 2]
-    vx = twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy
-    vy = twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz
-    vz = twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox
-    return vx, vy, vz
+    return rigid_velocity(shapes.tool_twist, tool, minus(point, row_of(shapes.tool_centre, tool)))
 
 
 @njit(**INLINED)
-def _middle(position, a, b, c):
+def _middle(position, corners):
     """Centroid of a triangle [m], and the squared radius of the sphere around it through the farthest corner [m^2]."""
-    x = (position[a, 0] + position[b, 0] + position[c, 0]) / 3.0
-    y = (position[a, 1] + position[b, 1] + position[c, 1]) / 3.0
-    z = (position[a, 2] + position[b, 2] + position[c, 2]) / 3.0
-    to_a = (position[a, 0] - x) ** 2 + (position[a, 1] - y) ** 2 + (position[a, 2] - z) ** 2
-    to_b = (position[b, 0] - x) ** 2 + (position[b, 1] - y) ** 2 + (position[b, 2] - z) ** 2
-    to_c = (position[c, 0] - x) ** 2 + (position[c, 1] - y) ** 2 + (position[c, 2] - z) ** 2
-    return x, y, z, max(to_a, to_b, to_c)
+    a, b, c = row_of(position, corners[0]), row_of(position, corners[1]), row_of(position, corners[2])
+    middle = divided(plus(plus(a, b), c), 3.0)
+    to_a, to_b, to_c = minus(a, middle), minus(b, middle), minus(c, middle)
+    return middle, max(scalar_product(to_a, to_a), scalar_product(to_b, to_b), scalar_product(to_c, to_c))
 
 
 @njit(**INLINED)
@@ -564,142 +504,89 @@ def _is_held(engaged, shape, triangle):
     return False
 
 
-@njit(**INLINED_KERNEL)
-def closest_on_axis(ends, shape, x, y, z):
-    """Point of a shape's axis nearest to a point.
-
-    In: ends of axes [m] (n_shape, 2, 3), shape: its number, x, y, z: the point [m]
-    Returns three coordinates [m].
-    """
-    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
-    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
-    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
-    length_squared = ux * ux + uy * uy + uz * uz
-    along = 0.0
-    if length_squared > 0.0:
-        along = (
-            (x - ends[shape, 0, 0]) * ux + (y - ends[shape, 0, 1]) * uy + (z - ends[shape, 0, 2]) * uz
-        ) / length_squared
-        along = min(1.0, max(0.0, along))
-    return ends[shape, 0, 0] + along * ux, ends[shape, 0, 1] + along * uy, ends[shape, 0, 2] + along * uz
+@njit(**INLINED)
+def end_of(shapes, shape, end):
+    """First (0) or second (1) end of a shape's axis [m]."""
+    return row_of(shapes.shape_ends[shape], end)
 
 
 @njit(**INLINED)
-def closest_on_core(ends, spans, shape, x, y, z):
-    """Point of a shape's core nearest to a point: on its axis, or across it in a rounded box.
+def closest_on_axis(shapes, shape, point):
+    """Point of a shape's axis nearest to a point [m]."""
+    first = end_of(shapes, shape, 0)
+    axis = minus(end_of(shapes, shape, 1), first)
+    length_squared = scalar_product(axis, axis)
+    along = 0.0
+    if length_squared > 0.0:
+        along = min(1.0, max(0.0, scalar_product(minus(point, first), axis) / length_squared))
+    return shifted(first, along, axis)
 
-    In: ends of axes [m] (n_shape, 2, 3), spans across them [m] (n_shape, 3), shape: its number, x, y, z: the point [m]
-    Returns three coordinates [m].
-    """
-    px, py, pz = closest_on_axis(ends, shape, x, y, z)
-    sx = spans[shape, 0]
-    sy = spans[shape, 1]
-    sz = spans[shape, 2]
-    squared = sx * sx + sy * sy + sz * sz
+
+@njit(**INLINED)
+def closest_on_core(shapes, shape, point):
+    """Point of a shape's core nearest to a point [m]: on its axis, or across it in a rounded box."""
+    near, span = closest_on_axis(shapes, shape, point), row_of(shapes.shape_span, shape)
+    squared = scalar_product(span, span)
     if squared > 0.0:
-        across = min(1.0, max(-1.0, ((x - px) * sx + (y - py) * sy + (z - pz) * sz) / squared))
-        px += across * sx
-        py += across * sy
-        pz += across * sz
-    return px, py, pz
+        across = min(1.0, max(-1.0, scalar_product(minus(point, near), span) / squared))
+        near = shifted(near, across, span)
+    return near
 
 
 @njit(**INLINED)
 def _release(engaged, stretch_memory, shape, item):
     """End the contact of one quadrature point with one shape."""
     engaged[shape, item] = 0
-    stretch_memory[shape, item, 0] = 0.0
-    stretch_memory[shape, item, 1] = 0.0
-    stretch_memory[shape, item, 2] = 0.0
+    for axis in range(3):
+        stretch_memory[shape, item, axis] = 0.0
 
 
 @njit(**INLINED)
-def _put_slope(rows, number, corner, weight, along_n, gx, gy, gz, nx, ny, nz):
-    """Write the slope of a point's penetration with one corner into its row, weight g + along_n n."""
-    rows[number, ROW_SLOPE + 3 * corner] = weight * gx + along_n * nx
-    rows[number, ROW_SLOPE + 3 * corner + 1] = weight * gy + along_n * ny
-    rows[number, ROW_SLOPE + 3 * corner + 2] = weight * gz + along_n * nz
+def corner_force(rows, number, corner, push, weight, drag):
+    """Corner's share of a point's force, -push dg/dx - weight drag [N]."""
+    return minus(times(-push, part_of_row(rows, number, ROW_SLOPE + 3 * corner)), times(weight, drag))
 
 
 @njit(**INLINED)
-def corner_force(rows, number, corner, push, weight, ux, uy, uz):
-    """Corner's share of a point's force, -push dg/dx - weight u [N]."""
-    return (
-        -push * rows[number, ROW_SLOPE + 3 * corner] - weight * ux,
-        -push * rows[number, ROW_SLOPE + 3 * corner + 1] - weight * uy,
-        -push * rows[number, ROW_SLOPE + 3 * corner + 2] - weight * uz,
-    )
-
-
-@njit(**INLINED)
-def _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, ux, uy, uz):
+def _push_corner(position, force, reference, wrench, tool, node, rows, number, corner, push, weight, drag):
     """Add a corner's share of a point's force, and its reaction."""
-    fx, fy, fz = corner_force(rows, number, corner, push, weight, ux, uy, uz)
-    force[node, 0] += fx
-    force[node, 1] += fy
-    force[node, 2] += fz
-    react(wrench, reference, tool, position[node, 0], position[node, 1], position[node, 2], fx, fy, fz)
+    share = corner_force(rows, number, corner, push, weight, drag)
+    add_to_row(force, node, share)
+    react(wrench, reference, tool, row_of(position, node), share)
 
 
 @njit(**INLINED)
-def react(wrench, reference, tool, x, y, z, fx, fy, fz):
+def react(wrench, reference, tool, point, force):
     """Subtract a force on the tissue at a point, and its torque about the reference, from the wrench on a tool."""
-    x -= reference[tool, 0]
-    y -= reference[tool, 1]
-    z -= reference[tool, 2]
-    wrench[tool, 0] -= fx
-    wrench[tool, 1] -= fy
-    wrench[tool, 2] -= fz
-    wrench[tool, 3] -= y * fz - z * fy
-    wrench[tool, 4] -= z * fx - x * fz
-    wrench[tool, 5] -= x * fy - y * fx
+    take_from_row(wrench, tool, 0, force)
+    take_from_row(wrench, tool, 3, vector_product(minus(point, row_of(reference, tool)), force))
 
 
 @njit(**INLINED)
-def _without_core(ends, spans, shape, px, py, pz, gx, gy, gz):
-    """Remove the part of g along a shape's core, if the nearest point (px, py, pz) lies strictly inside its borders."""
-    ux = ends[shape, 1, 0] - ends[shape, 0, 0]
-    uy = ends[shape, 1, 1] - ends[shape, 0, 1]
-    uz = ends[shape, 1, 2] - ends[shape, 0, 2]
-    px -= ends[shape, 0, 0]
-    py -= ends[shape, 0, 1]
-    pz -= ends[shape, 0, 2]
-    length_squared = ux * ux + uy * uy + uz * uz
+def _without_core(shapes, shape, near, slope):
+    """Remove the part of a slope along a shape's core, if its nearest point lies strictly inside its borders."""
+    first = end_of(shapes, shape, 0)
+    axis, place = minus(end_of(shapes, shape, 1), first), minus(near, first)
+    length_squared = scalar_product(axis, axis)
     if length_squared > 0.0:
-        along = px * ux + py * uy + pz * uz
+        along = scalar_product(place, axis)
         if BORDER * length_squared < along < (1.0 - BORDER) * length_squared:
-            share = (gx * ux + gy * uy + gz * uz) / length_squared
-            gx -= share * ux
-            gy -= share * uy
-            gz -= share * uz
-    ux = spans[shape, 0]
-    uy = spans[shape, 1]
-    uz = spans[shape, 2]
-    length_squared = ux * ux + uy * uy + uz * uz
-    if length_squared > 0.0 and abs(px * ux + py * uy + pz * uz) < (1.0 - BORDER) * length_squared:
-        share = (gx * ux + gy * uy + gz * uz) / length_squared
-        gx -= share * ux
-        gy -= share * uy
-        gz -= share * uz
-    return gx, gy, gz
+            slope = minus(slope, times(scalar_product(slope, axis) / length_squared, axis))
+    span = row_of(shapes.shape_span, shape)
+    length_squared = scalar_product(span, span)
+    if length_squared > 0.0 and abs(scalar_product(place, span)) < (1.0 - BORDER) * length_squared:
+        slope = minus(slope, times(scalar_product(slope, span) / length_squared, span))
+    return slope
 
 
 @njit(**INLINED)
 def lag_point(position, surface, stretch, shapes, response, shape, triangle, point):
     """Shift the stretch of a point by its tool's lag."""
     tool, item = shapes.shape_tool[shape], triangle * QUADRATURE_COUNT + point
-    centre, lag = shapes.tool_centre, response.tool_lag
-    ox = -centre[tool, 0]
-    oy = -centre[tool, 1]
-    oz = -centre[tool, 2]
+    offset = opposite(row_of(shapes.tool_centre, tool))
     for corner in range(3):
-        weight = QUADRATURE_BARYCENTRIC[point, corner]
-        ox += weight * position[surface[triangle, corner], 0]
-        oy += weight * position[surface[triangle, corner], 1]
-        oz += weight * position[surface[triangle, corner], 2]
-    stretch[shape, item, 0] -= lag[tool, 0] + lag[tool, 4] * oz - lag[tool, 5] * oy
-    stretch[shape, item, 1] -= lag[tool, 1] + lag[tool, 5] * ox - lag[tool, 3] * oz
-    stretch[shape, item, 2] -= lag[tool, 2] + lag[tool, 3] * oy - lag[tool, 4] * ox
+        offset = shifted(offset, QUADRATURE_BARYCENTRIC[point, corner], row_of(position, surface[triangle, corner]))
+    take_from_row(stretch[shape], item, 0, rigid_velocity(response.tool_lag, tool, offset))
 
 
 @njit(**INNER)

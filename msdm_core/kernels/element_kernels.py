@@ -7,6 +7,7 @@ agree to the bit if sums have the same order.
 from numba import njit
 
 from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL
+from msdm_core.kernels.space_kernels import scalar_product, vector_product
 from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 
 # Below this volume ratio s a tet also has a barrier pressure for the share K' of its volume term averaged at nodes: an
@@ -21,15 +22,9 @@ STRAIN_LEAST = 1e-30
 
 
 @njit(**INLINED)
-def edge(position, a, b):
-    """Vector from one node to another, of positions (n_node, 3) [m]."""
-    return position[b, 0] - position[a, 0], position[b, 1] - position[a, 1], position[b, 2] - position[a, 2]
-
-
-@njit(**INLINED)
-def spring_length(dx, dy, dz):
-    """Length of a spring [m]; d: from one end to the other [m]."""
-    return root(dx * dx + dy * dy + dz * dz)
+def spring_length(along):
+    """Length of a spring [m]; along: from one end to the other [m]."""
+    return root(scalar_product(along, along))
 
 
 @njit(**INLINED)
@@ -87,39 +82,24 @@ def faded_share(duration, time):
 
 
 @njit(**INLINED)
-def spring_drag(dx, dy, dz, vx, vy, vz, stiffness, beta):
+def spring_drag(along, velocity, stiffness, beta):
     """Force over length of Rayleigh's beta in a spring, k beta (dl/dt) / l.
 
-    In: d: from one end to the other [m], v: difference of their velocities [m/s], stiffness k [N/m], beta [s]
+    In: along: from one end to the other [m], velocity: difference of their velocities [m/s], stiffness k [N/m],
+        beta [s]
     Returns [N/m].
     """
-    return stiffness * beta * (dx * vx + dy * vy + dz * vz) / (dx * dx + dy * dy + dz * dz)
-
-
-@njit(**INLINED)
-def corner_gradient(c, d):
-    """Six times the gradient dV/dx of the volume of a tet at one corner, c x d [m^2].
-
-    In: c, d: edges from the corner a to the next two corners, in the order b, c, d, b, c [m]
-    """
-    return c[1] * d[2] - c[2] * d[1], c[2] * d[0] - c[0] * d[2], c[0] * d[1] - c[1] * d[0]
-
-
-@njit(**INLINED)
-def six_volumes(b, gradient):
-    """Six times the volume of a tet: one edge times six times its gradient.
-
-    In: b: edge from the corner a [m], gradient: `corner_gradient` at b [m^2]
-    Returns [m^3].
-    """
-    return b[0] * gradient[0] + b[1] * gradient[1] + b[2] * gradient[2]
+    return stiffness * beta * scalar_product(along, velocity) / scalar_product(along, along)
 
 
 @njit(**INLINED)
 def tet_shape(b, c, d):
-    """`corner_gradient` at b [m^2] and six times the volume of a tet [m^3]; b, c, d: edges from the corner a [m]."""
-    gradient = corner_gradient(c, d)
-    return gradient, six_volumes(b, gradient)
+    """Six times the gradient dV/dx of the volume of a tet at b, c x d [m^2], and six times the volume [m^3].
+
+    In: b, c, d: edges from the corner a [m]; the gradients at c and d are d x b and b x c
+    """
+    gradient = vector_product(c, d)
+    return gradient, scalar_product(b, gradient)
 
 
 @njit(**INLINED)
@@ -130,15 +110,15 @@ def six_rates(b, c, d, b_rate, c_rate, d_rate):
     Returns [m^3/s].
     """
     return (
-        six_volumes(b_rate, corner_gradient(c, d))
-        + six_volumes(c_rate, corner_gradient(d, b))
-        + six_volumes(d_rate, corner_gradient(b, c))
+        scalar_product(b_rate, vector_product(c, d))
+        + scalar_product(c_rate, vector_product(d, b))
+        + scalar_product(d_rate, vector_product(b, c))
     )
 
 
 @njit(**INLINED)
 def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
-    """Factor from `corner_gradient` to the forces of a tet on its corners: minus a sixth of its tension.
+    """Factor from six times the gradients dV/dx to the forces of a tet on its corners: minus a sixth of its tension.
 
     The tension is K (J - 1), plus the mean tension of the volumes averaged at its corners, plus K' (J - s) s / J for J
     below s = SQUEEZED_RATIO.

@@ -10,7 +10,6 @@ from numba import njit
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
-    corner_gradient,
     node_law,
     node_tension,
     spring_energy,
@@ -35,6 +34,7 @@ from msdm_core.kernels.gather_kernels import (
     tet_edges,
 )
 from msdm_core.kernels.option_kernels import INLINED, INNER
+from msdm_core.kernels.space_kernels import minus, times, vector_product
 from msdm_core.kernels.vector_kernels import (
     GROUP,
     any_below,
@@ -80,8 +80,7 @@ def add_energy_groups(model, state):
     stiffness, rest_length, begin = model.spring_stiffness, model.spring_rest_length, model.tet_nodes.shape[0]
     whole = begin + (nodes.shape[0] - begin) // GROUP * GROUP
     for first in range(begin, whole, GROUP):
-        x, y, z = columns(edge_rows(position, nodes, first))
-        length = spring_length(x, y, z)
+        length = spring_length(columns(edge_rows(position, nodes, first)))
         store_group(lengths, first, length)
         energy = spring_energy(length, load_group(rest_length, first), load_group(stiffness, first))
         add_at_ends(pairs, nodes, first, energy)
@@ -132,11 +131,10 @@ def add_spring_groups(model, state, law):
     steep_count = 0
     for first in range(begin, whole, GROUP):
         rows = edge_rows(position, nodes, first)
-        x, y, z = columns(rows)
         if model.stiffens:
             length = load_group(lengths, first)
         else:
-            length = spring_length(x, y, z)
+            length = spring_length(columns(rows))
         share = load_group(rest_length, first) / length
         rigidity = load_group(stiffness, first)
         scale = spring_scale(share, rigidity)
@@ -165,7 +163,7 @@ def sum_tet_groups(model, state):
         b, c, d = tet_edges(position, tets, first)
         _, six = tet_shape(b, c, d)
         if stiffens:
-            length = spring_length(b[0], b[1], b[2])
+            length = spring_length(b)
             store_group(lengths, first, length)
             energy = spring_energy(length, load_group(rest_length, first), load_group(stiffness, first))
             add_pairs(pairs, tets, first, (six, energy))
@@ -200,7 +198,7 @@ def add_tet_groups(model, state, law, steep_count):
             averaged, factor = pair_sums(pairs, tets, first)
             length = load_group(lengths, first)
         else:
-            averaged, length = corner_sums(tension, tets, first), spring_length(b[0], b[1], b[2])
+            averaged, length = corner_sums(tension, tets, first), spring_length(b)
             factor = length
         bulk, averaged_bulk = load_group(model.tet_bulk, first), load_group(model.tet_averaged_bulk, first)
         scale = tet_scale(ratio, bulk, averaged_bulk, 0.25 * averaged)
@@ -216,12 +214,8 @@ def add_tet_groups(model, state, law, steep_count):
             if law.fades:
                 _fade_arms(model, state, first, pull / share, law.fade)
             pull = pull * load_group(model.spring_gain, first) - load_group(state.spring_relief, first) * share
-        at_b = (
-            scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
-        )  # fmt: skip
-        g = corner_gradient(d, b)
-        at_c = (scale * g[0], scale * g[1], scale * g[2])
-        g = corner_gradient(b, c)
-        push_corners(force, tets, first, (at_b, at_c, (scale * g[0], scale * g[1], scale * g[2])))
+        at_b = minus(times(scale, gradient), times(pull, b))
+        at_c, at_d = times(scale, vector_product(d, b)), times(scale, vector_product(b, c))
+        push_corners(force, tets, first, (at_b, at_c, at_d))
     low[0] = fold_lower(lowest, low[0])
     return whole, count, steep_count

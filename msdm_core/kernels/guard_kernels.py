@@ -5,9 +5,20 @@ from typing import NamedTuple
 
 from numba import njit
 
-from msdm_core.kernels.contact_kernels import closest_on_axis, react, tool_velocity
-from msdm_core.kernels.element_kernels import corner_gradient, edge
-from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL, INNER
+from msdm_core.kernels.contact_kernels import closest_on_axis, end_of, react, tool_velocity
+from msdm_core.kernels.option_kernels import INLINED, INNER
+from msdm_core.kernels.space_kernels import (
+    add_to_row,
+    divided,
+    edge,
+    length_of,
+    minus,
+    row_of,
+    scalar_product,
+    shifted,
+    times,
+    vector_product,
+)
 
 # Reach of the guard around a shape's axis, as a share of its radius; ordinary presses stay far from it.
 GUARD_SHARE = 0.6
@@ -91,50 +102,34 @@ def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, wat
 
     In: position [m], velocity [m/s] (n_node, 3), surface (n_surface, 3), shapes, law, dt [s], watched [m]
     """
-    ends = shapes.shape_ends
     radius = shapes.shape_radius[shape]
     reach = GUARD_SHARE * radius
-    a = surface[triangle, 0]
-    b = surface[triangle, 1]
-    c = surface[triangle, 2]
+    corners = row_of(surface, triangle)
+    a, b, c = corners
     none = radius * 0.0
-    far = _NearPoint((a, b, c), (none, none, none), (none, none, none), (none, none, none), none, none, none)
-    b_edge, c_edge = edge(position, a, b), edge(position, a, c)
-    bx, by, bz = b_edge
-    cx, cy, cz = c_edge
-    nx, ny, nz = corner_gradient(b_edge, c_edge)
-    twice_area = math.sqrt(nx * nx + ny * ny + nz * nz)
-    first = 0.0
-    second = 0.0
-    for axis, part in ((0, nx), (1, ny), (2, nz)):
-        first += (ends[shape, 0, axis] - position[a, axis]) * part
-        second += (ends[shape, 1, axis] - position[a, axis]) * part
+    nowhere = (none, none, none)
+    far = _NearPoint(corners, nowhere, nowhere, nowhere, none, none, none)
+    corner, b_edge, c_edge = row_of(position, a), edge(position, a, b), edge(position, a, c)
+    normal = vector_product(b_edge, c_edge)
+    twice_area = length_of(normal)
+    first = scalar_product(minus(end_of(shapes, shape, 0), corner), normal)
+    second = scalar_product(minus(end_of(shapes, shape, 1), corner), normal)
     low = 0 if first < second else 1
     if min(first, second) > watched * twice_area or max(first, second) < -watched * twice_area:
         return FAR, far
-    if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, a, b, c):
+    if min(first, second) <= 0.0 and _passed(shapes, shape, position, velocity, dt, corners):
         return PASSED, far
     # The triangle's point nearest to the axis' lower end, against the axis: exact for a ball, approximate for a shaft.
-    wb, wc = closest_in_triangle(
-        bx, by, bz, cx, cy, cz,
-        ends[shape, low, 0] - position[a, 0], ends[shape, low, 1] - position[a, 1],
-        ends[shape, low, 2] - position[a, 2],
-    )  # fmt: skip
-    x = position[a, 0] + wb * bx + wc * cx
-    y = position[a, 1] + wb * by + wc * cy
-    z = position[a, 2] + wb * bz + wc * cz
-    px, py, pz = closest_on_axis(ends, shape, x, y, z)
-    ex = x - px
-    ey = y - py
-    ez = z - pz
-    distance = math.sqrt(ex * ex + ey * ey + ez * ez)
+    wb, wc = closest_in_triangle(b_edge, c_edge, minus(end_of(shapes, shape, low), corner))
+    place = shifted(shifted(corner, wb, b_edge), wc, c_edge)
+    out = minus(place, closest_on_axis(shapes, shape, place))
+    distance = length_of(out)
     # Behind the triangle, beyond an edge: another triangle lies between.
-    if distance >= reach or ex * nx + ey * ny + ez * nz >= 0.0:
+    if distance >= reach or scalar_product(out, normal) >= 0.0:
         return FAR, far
-    direction = (ex / distance, ey / distance, ez / distance)
     stiffness = PI * radius * radius * law.stiffness
     weights = (1.0 - wb - wc, wb, wc)
-    return NEAR, _NearPoint((a, b, c), weights, (x, y, z), direction, distance, reach, stiffness)
+    return NEAR, _NearPoint(corners, weights, place, divided(out, distance), distance, reach, stiffness)
 
 
 @njit(**INLINED)
@@ -146,15 +141,10 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
     Out:   state: node_force [N] (n_node, 3), wrench, added to [N, N m] (n_tool, 6)
     """
     velocity, force, inverse_mass = state.node_velocity, state.node_force, model.node_inverse_mass
-    twist, centre, mobility = shapes.tool_twist, shapes.tool_centre, response.tool_mobility
-    ex, ey, ez = near.direction
-    x, y, z = near.place
-    ox = x - centre[tool, 0]
-    oy = y - centre[tool, 1]
-    oz = z - centre[tool, 2]
-    vx, vy, vz = tool_velocity(twist, centre, tool, x, y, z)
-    speed = -(ex * vx + ey * vy + ez * vz)
-    lever = (ex, ey, ez, oy * ez - oz * ey, oz * ex - ox * ez, ox * ey - oy * ex)
+    mobility, out = response.tool_mobility, near.direction
+    speed = -scalar_product(out, tool_velocity(shapes, tool, near.place))
+    turn = vector_product(minus(near.place, row_of(shapes.tool_centre, tool)), out)
+    lever = (out[0], out[1], out[2], turn[0], turn[1], turn[2])
     give = 0.0
     for row in range(6):
         for column in range(6):
@@ -162,95 +152,67 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
     for corner in range(3):
         node, weight = near.corners[corner], near.weights[corner]
         rate = dt * inverse_mass[node]
-        speed += weight * (
-            ex * (velocity[node, 0] + rate * force[node, 0])
-            + ey * (velocity[node, 1] + rate * force[node, 1])
-            + ez * (velocity[node, 2] + rate * force[node, 2])
-        )
+        speed += weight * scalar_product(out, shifted(row_of(velocity, node), rate, row_of(force, node)))
         give += weight * weight * rate
     closeness = near.reach / near.distance
     slope = near.stiffness * closeness**2
     push = near.stiffness * near.reach * (closeness - 1.0) - slope * dt * speed
     push = max(0.0, push / (1.0 + slope * dt * give))
-    fx = push * ex
-    fy = push * ey
-    fz = push * ez
+    push_out = times(push, out)
     for corner in range(3):
-        node, weight = near.corners[corner], near.weights[corner]
-        force[node, 0] += weight * fx
-        force[node, 1] += weight * fy
-        force[node, 2] += weight * fz
-    react(wrench, reference, tool, x, y, z, fx, fy, fz)
+        add_to_row(force, near.corners[corner], times(near.weights[corner], push_out))
+    react(wrench, reference, tool, near.place, push_out)
 
 
 @njit(**INNER)
-def _passed(shapes, shape, position, velocity, dt, a, b, c):
+def _passed(shapes, shape, position, velocity, dt, corners):
     """True if an end of a shape's axis went through a triangle in the last substep, or the axis now sticks in it."""
-    ends, twist, centre, tool = shapes.shape_ends, shapes.tool_twist, shapes.tool_centre, shapes.shape_tool[shape]
-    highest, highest_b, highest_c = 0.0, 0.0, 0.0
-    lowest, lowest_b, lowest_c = 0.0, 0.0, 0.0
+    highest = lowest = (0.0, 0.0, 0.0)
     for end in range(2):
-        x = ends[shape, end, 0]
-        y = ends[shape, end, 1]
-        z = ends[shape, end, 2]
-        now, now_b, now_c = _foot(x, y, z, position, velocity, 0.0, a, b, c)
-        vx, vy, vz = tool_velocity(twist, centre, tool, x, y, z)
-        x -= dt * vx
-        y -= dt * vy
-        z -= dt * vz
-        then, then_b, then_c = _foot(x, y, z, position, velocity, dt, a, b, c)
-        if then > 0.0 >= now and _is_inside(then, then_b, then_c, now, now_b, now_c):
+        place = end_of(shapes, shape, end)
+        now = _foot(place, position, velocity, 0.0, corners)
+        before = minus(place, times(dt, tool_velocity(shapes, shapes.shape_tool[shape], place)))
+        then = _foot(before, position, velocity, dt, corners)
+        if then[0] > 0.0 >= now[0] and _is_inside(then, now):
             return True
-        if now > highest:
-            highest, highest_b, highest_c = now, now_b, now_c
-        if now < lowest:
-            lowest, lowest_b, lowest_c = now, now_b, now_c
-    return highest > 0.0 > lowest and _is_inside(highest, highest_b, highest_c, lowest, lowest_b, lowest_c)
+        if now[0] > highest[0]:
+            highest = now
+        if now[0] < lowest[0]:
+            lowest = now
+    return highest[0] > 0.0 > lowest[0] and _is_inside(highest, lowest)
 
 
 @njit(**INLINED)
-def _foot(x, y, z, position, velocity, dt, a, b, c):
+def _foot(point, position, velocity, dt, corners):
     """Height of a point over a triangle dt ago [m], and its foot's weights of the corners b and c."""
-    ax = position[a, 0] - dt * velocity[a, 0]
-    ay = position[a, 1] - dt * velocity[a, 1]
-    az = position[a, 2] - dt * velocity[a, 2]
-    bx = position[b, 0] - dt * velocity[b, 0] - ax
-    by = position[b, 1] - dt * velocity[b, 1] - ay
-    bz = position[b, 2] - dt * velocity[b, 2] - az
-    cx = position[c, 0] - dt * velocity[c, 0] - ax
-    cy = position[c, 1] - dt * velocity[c, 1] - ay
-    cz = position[c, 2] - dt * velocity[c, 2] - az
-    px = x - ax
-    py = y - ay
-    pz = z - az
-    nx, ny, nz = corner_gradient((bx, by, bz), (cx, cy, cz))
-    squared = nx * nx + ny * ny + nz * nz
-    wb = ((py * cz - pz * cy) * nx + (pz * cx - px * cz) * ny + (px * cy - py * cx) * nz) / squared
-    wc = ((by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz) / squared
-    return (px * nx + py * ny + pz * nz) / math.sqrt(squared), wb, wc
+    a = minus(row_of(position, corners[0]), times(dt, row_of(velocity, corners[0])))
+    b = minus(minus(row_of(position, corners[1]), times(dt, row_of(velocity, corners[1]))), a)
+    c = minus(minus(row_of(position, corners[2]), times(dt, row_of(velocity, corners[2]))), a)
+    p, normal = minus(point, a), vector_product(b, c)
+    squared = scalar_product(normal, normal)
+    wb = scalar_product(vector_product(p, c), normal) / squared
+    wc = scalar_product(vector_product(b, p), normal) / squared
+    return scalar_product(p, normal) / math.sqrt(squared), wb, wc
 
 
 @njit(**INLINED)
-def _is_inside(high, high_b, high_c, low, low_b, low_c):
-    """True if the path from a height above a triangle to a height below leads through it, its edges included."""
-    share = high / (high - low)
-    wb = high_b + share * (low_b - high_b)
-    wc = high_c + share * (low_c - high_c)
+def _is_inside(high, low):
+    """True if the path from above a triangle to below it, by `_foot`, leads through it, its edges included."""
+    share = high[0] / (high[0] - low[0])
+    wb = high[1] + share * (low[1] - high[1])
+    wc = high[2] + share * (low[2] - high[2])
     return wb >= -EDGE_WIDTH and wc >= -EDGE_WIDTH and wb + wc <= 1.0 + EDGE_WIDTH
 
 
-@njit(**INLINED_KERNEL)
-def closest_in_triangle(bx, by, bz, cx, cy, cz, px, py, pz):
+@njit(**INLINED)
+def closest_in_triangle(b, c, p):
     """Point of a triangle nearest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
 
     In: b, c: edges from the corner a [m], p: from the corner a to the point [m]
     Returns the weights of the corners b and c.
     """
-    bb = bx * bx + by * by + bz * bz
-    cc = cx * cx + cy * cy + cz * cz
-    bc = bx * cx + by * cy + bz * cz
-    pb = px * bx + py * by + pz * bz
-    pc = px * cx + py * cy + pz * cz
+    bb, cc, bc = scalar_product(b, b), scalar_product(c, c), scalar_product(b, c)
+    pb, pc = scalar_product(p, b), scalar_product(p, c)
     determinant = bb * cc - bc * bc
     wb = cc * pb - bc * pc
     wc = bb * pc - bc * pb

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from msdm_core.kernels.option_kernels import ALLOCATING_KERNEL, INLINED
+from msdm_core.kernels.space_kernels import minus, plus, row_of, set_row
 from msdm_core.kernels.vector_kernels import (
     GROUP,
     define_extract,
@@ -149,17 +150,30 @@ def where_moving(lanes, moving, after, before):
 
 
 @njit(**INLINED)
-def difference(lanes, values, items, item, corner):
-    """Vector from corner 0 of an item to another corner, of an array of nodes: x, y and z."""
+def at_node(lanes, values, node):
+    """Vector of a node, of an array of nodes."""
     if len(lanes) == 0:
-        a, b = items[item, 0], items[item, corner]
-        return values[b, 0] - values[a, 0], values[b, 1] - values[a, 1], values[b, 2] - values[a, 2]
-    i, j = 3 * np.intp(items[item, 0]), 3 * np.intp(items[item, corner])
-    return (
-        load_lanes(lanes, values, j) - load_lanes(lanes, values, i),
-        load_lanes(lanes, values, j + 1) - load_lanes(lanes, values, i + 1),
-        load_lanes(lanes, values, j + 2) - load_lanes(lanes, values, i + 2),
-    )
+        return row_of(values, node)
+    part = 3 * np.intp(node)
+    return load_lanes(lanes, values, part), load_lanes(lanes, values, part + 1), load_lanes(lanes, values, part + 2)
+
+
+@njit(**INLINED)
+def set_node(lanes, values, node, vector):
+    """Store for `at_node`."""
+    if len(lanes) == 0:
+        set_row(values, node, 0, vector)
+    else:
+        part = 3 * np.intp(node)
+        store_lanes(values, part, vector[0])
+        store_lanes(values, part + 1, vector[1])
+        store_lanes(values, part + 2, vector[2])
+
+
+@njit(**INLINED)
+def difference(lanes, values, items, item, corner):
+    """Vector from corner 0 of an item to another corner, of an array of nodes."""
+    return minus(at_node(lanes, values, items[item, corner]), at_node(lanes, values, items[item, 0]))
 
 
 @njit(**INLINED)
@@ -173,31 +187,15 @@ def three_edges(lanes, values, tets, tet):
 
 
 @njit(**INLINED)
-def add_to_node(lanes, force, node, x, y, z):
-    """Add x, y and z to a node's force."""
-    if len(lanes) == 0:
-        force[node, 0] += x
-        force[node, 1] += y
-        force[node, 2] += z
-    else:
-        part = 3 * np.intp(node)
-        store_lanes(force, part, load_lanes(lanes, force, part) + x)
-        store_lanes(force, part + 1, load_lanes(lanes, force, part + 1) + y)
-        store_lanes(force, part + 2, load_lanes(lanes, force, part + 2) + z)
+def add_to_node(lanes, force, node, share):
+    """Add a vector to a node's force."""
+    set_node(lanes, force, node, plus(at_node(lanes, force, node), share))
 
 
 @njit(**INLINED)
-def take_from_node(lanes, force, node, x, y, z):
-    """Subtract x, y and z from a node's force."""
-    if len(lanes) == 0:
-        force[node, 0] -= x
-        force[node, 1] -= y
-        force[node, 2] -= z
-    else:
-        part = 3 * np.intp(node)
-        store_lanes(force, part, load_lanes(lanes, force, part) - x)
-        store_lanes(force, part + 1, load_lanes(lanes, force, part + 1) - y)
-        store_lanes(force, part + 2, load_lanes(lanes, force, part + 2) - z)
+def take_from_node(lanes, force, node, share):
+    """Subtract a vector from a node's force."""
+    set_node(lanes, force, node, minus(at_node(lanes, force, node), share))
 
 
 @njit(**INLINED)

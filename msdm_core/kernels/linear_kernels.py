@@ -3,8 +3,16 @@
 import numpy as np
 from numba import njit
 
-from msdm_core.kernels.element_kernels import corner_gradient, edge
 from msdm_core.kernels.option_kernels import KERNEL
+from msdm_core.kernels.space_kernels import (
+    add_to_row,
+    divided,
+    edge,
+    scalar_product,
+    take_from_row,
+    times,
+    vector_product,
+)
 
 
 @njit(**KERNEL)
@@ -23,19 +31,11 @@ def multiply_stiffness(
     for spring in range(nodes.shape[0]):
         i = np.uint32(nodes[spring, 0])
         j = np.uint32(nodes[spring, 1])
-        dx, dy, dz = edge(rest, i, j)
-        stretch = (
-            dx * (displacement[j, 0] - displacement[i, 0])
-            + dy * (displacement[j, 1] - displacement[i, 1])
-            + dz * (displacement[j, 2] - displacement[i, 2])
-        )
-        scale = stiffness[spring] * stretch / (dx * dx + dy * dy + dz * dz)
-        force[i, 0] -= scale * dx
-        force[i, 1] -= scale * dy
-        force[i, 2] -= scale * dz
-        force[j, 0] += scale * dx
-        force[j, 1] += scale * dy
-        force[j, 2] += scale * dz
+        along = edge(rest, i, j)
+        stretch = scalar_product(along, edge(displacement, i, j))
+        pull = times(stiffness[spring] * stretch / scalar_product(along, along), along)
+        take_from_row(force, i, 0, pull)
+        add_to_row(force, j, pull)
     for tet in range(tets.shape[0]):
         change = _volume_change(rest, tets, tet, displacement)
         for corner in range(4):
@@ -48,14 +48,9 @@ def multiply_stiffness(
         for corner in range(4):
             scale += 0.25 * pressure[tets[tet, corner]]
         for corner in range(1, 4):
-            gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
-            node = np.uint32(tets[tet, corner])
-            force[node, 0] += scale * gx
-            force[node, 1] += scale * gy
-            force[node, 2] += scale * gz
-            force[a, 0] -= scale * gx
-            force[a, 1] -= scale * gy
-            force[a, 2] -= scale * gz
+            push = times(scale, _corner_gradient(rest, tets, tet, corner))
+            add_to_row(force, np.uint32(tets[tet, corner]), push)
+            take_from_row(force, a, 0, push)
 
 
 @njit(cache=True, inline="always", nogil=True, error_model="numpy")
@@ -64,13 +59,8 @@ def _volume_change(rest, tets, tet, displacement):
     a = np.uint32(tets[tet, 0])
     change = 0.0
     for corner in range(1, 4):
-        gx, gy, gz = _corner_gradient(rest, tets, tet, corner)
-        node = np.uint32(tets[tet, corner])
-        change += (
-            gx * (displacement[node, 0] - displacement[a, 0])
-            + gy * (displacement[node, 1] - displacement[a, 1])
-            + gz * (displacement[node, 2] - displacement[a, 2])
-        )
+        along = edge(displacement, a, np.uint32(tets[tet, corner]))
+        change += scalar_product(_corner_gradient(rest, tets, tet, corner), along)
     return change
 
 
@@ -80,5 +70,4 @@ def _corner_gradient(position, tets, tet, corner):
     a = np.uint32(tets[tet, 0])
     p = np.uint32(tets[tet, 1 + corner % 3])
     q = np.uint32(tets[tet, 1 + (corner + 1) % 3])
-    x, y, z = corner_gradient(edge(position, a, p), edge(position, a, q))
-    return x / 6.0, y / 6.0, z / 6.0
+    return divided(vector_product(edge(position, a, p), edge(position, a, q)), 6.0)

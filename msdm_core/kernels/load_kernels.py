@@ -15,8 +15,20 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
     closest_on_core,
 )
-from msdm_core.kernels.element_kernels import corner_gradient, edge, tet_shape
+from msdm_core.kernels.element_kernels import tet_shape
 from msdm_core.kernels.option_kernels import KERNEL
+from msdm_core.kernels.space_kernels import (
+    add_to_row,
+    divided,
+    edge,
+    length_of,
+    minus,
+    row_of,
+    scalar_product,
+    shifted,
+    times,
+    vector_product,
+)
 
 
 @njit(**KERNEL)
@@ -28,27 +40,21 @@ def add_pressures(model, state, shapes, stiffness, push):
     Out:   push, added to [N] (n_node,)
     """
     position, engaged, surface = state.node_position, state.contact_engaged, model.surface_triangles
-    ends, spans, area = shapes.shape_ends, shapes.shape_span, model.surface_rest_area
+    area = model.surface_rest_area
     for shape in range(shapes.shape_radius.shape[0]):
         radius = shapes.shape_radius[shape]
         for item in range(engaged.shape[1]):
             if not engaged[shape, item]:
                 continue
             triangle, point = item // QUADRATURE_COUNT, item % QUADRATURE_COUNT
-            a, b, c = surface[triangle, 0], surface[triangle, 1], surface[triangle, 2]
+            a, b, c = row_of(surface, triangle)
             b_edge, c_edge = edge(position, a, b), edge(position, a, c)
-            bx, by, bz = b_edge
-            cx, cy, cz = c_edge
-            nx, ny, nz = corner_gradient(b_edge, c_edge)
-            size = math.sqrt(nx * nx + ny * ny + nz * nz)
+            normal = vector_product(b_edge, c_edge)
             wb, wc = QUADRATURE_BARYCENTRIC[point, 1], QUADRATURE_BARYCENTRIC[point, 2]
-            x = position[a, 0] + wb * bx + wc * cx
-            y = position[a, 1] + wb * by + wc * cy
-            z = position[a, 2] + wb * bz + wc * cz
-            px, py, pz = closest_on_core(ends, spans, shape, x, y, z)
-            x, y, z = x - px, y - py, z - pz
-            t = (x * nx + y * ny + z * nz) / size
-            chord_squared = radius * radius - (x * x + y * y + z * z - t * t)
+            place = shifted(shifted(row_of(position, a), wb, b_edge), wc, c_edge)
+            out = minus(place, closest_on_core(shapes, shape, place))
+            t = scalar_product(out, normal) / length_of(normal)
+            chord_squared = radius * radius - (scalar_product(out, out) - t * t)
             if chord_squared > 0.0:
                 s = math.sqrt(chord_squared)
                 force = QUADRATURE_WEIGHT * area[triangle] * stiffness * s * max(s + t, 0.0) / radius
@@ -68,19 +74,14 @@ def add_gradients(rest, position, tets, gradient):
         i, j, k, m = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
         a, b, c = edge(rest, i, j), edge(rest, i, k), edge(rest, i, m)
         # Six times V times the inverse of the rest edges: their cofactors.
-        u, v, w = corner_gradient(b, c), corner_gradient(c, a), corner_gradient(a, b)
+        u, v, w = vector_product(b, c), vector_product(c, a), vector_product(a, b)
+        u, v, w = divided(u, 6.0), divided(v, 6.0), divided(w, 6.0)
         for row in range(3):
-            along_a = position[j, row] - position[i, row]
-            along_b = position[k, row] - position[i, row]
-            along_c = position[m, row] - position[i, row]
-            x = along_a * (u[0] / 6.0) + along_b * (v[0] / 6.0) + along_c * (w[0] / 6.0)
-            y = along_a * (u[1] / 6.0) + along_b * (v[1] / 6.0) + along_c * (w[1] / 6.0)
-            z = along_a * (u[2] / 6.0) + along_b * (v[2] / 6.0) + along_c * (w[2] / 6.0)
+            part = times(position[j, row] - position[i, row], u)
+            part = shifted(part, position[k, row] - position[i, row], v)
+            part = shifted(part, position[m, row] - position[i, row], w)
             for corner in range(4):
-                node = tets[tet, corner]
-                gradient[node, row, 0] += x
-                gradient[node, row, 1] += y
-                gradient[node, row, 2] += z
+                add_to_row(gradient[tets[tet, corner]], row, part)
 
 
 @njit(**KERNEL)

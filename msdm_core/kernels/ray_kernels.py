@@ -8,21 +8,21 @@ import numpy as np
 from numba import njit
 
 from msdm_core.kernels.option_kernels import INLINED, KERNEL
+from msdm_core.kernels.space_kernels import edge, minus, row_of, scalar_product, vector_product
 
 
 @njit(**INLINED)
-def ray_hit(ox, oy, oz, dx, dy, dz, bx, by, bz, cx, cy, cz):
-    """Intersection of a ray with a triangle, in multiples of d from its origin; nan without an intersection.
+def ray_hit(origin, direction, b, c):
+    """Intersection of a ray with a triangle, in multiples of its direction; nan without an intersection.
 
-    In: o: from the triangle's corner a to the origin of the ray [m], d: the ray, b and c: edges from a [m]
+    In: origin: of the ray, from the triangle's corner a [m], direction: of the ray, b and c: edges from a [m]
     """
-    px, py, pz = dy * cz - dz * cy, dz * cx - dx * cz, dx * cy - dy * cx
-    qx, qy, qz = oy * bz - oz * by, oz * bx - ox * bz, ox * by - oy * bx
-    volume = bx * px + by * py + bz * pz
-    first = (ox * px + oy * py + oz * pz) / volume
-    second = (dx * qx + dy * qy + dz * qz) / volume
+    p, q = vector_product(direction, c), vector_product(origin, b)
+    volume = scalar_product(b, p)
+    first = scalar_product(origin, p) / volume
+    second = scalar_product(direction, q) / volume
     if first >= 0.0 and second >= 0.0 and first + second <= 1.0:
-        return (cx * qx + cy * qy + cz * qz) / volume
+        return scalar_product(c, q) / volume
     return np.nan
 
 
@@ -56,10 +56,6 @@ def pierces(origins, directions, corners, pierced):
 @njit(**INLINED)
 def _hit_of(origins, directions, ray, corners, triangle):
     """`ray_hit` of one ray and one triangle of arrays."""
-    ax, ay, az = corners[triangle, 0, 0], corners[triangle, 0, 1], corners[triangle, 0, 2]
-    return ray_hit(
-        origins[ray, 0] - ax, origins[ray, 1] - ay, origins[ray, 2] - az,
-        directions[ray, 0], directions[ray, 1], directions[ray, 2],
-        corners[triangle, 1, 0] - ax, corners[triangle, 1, 1] - ay, corners[triangle, 1, 2] - az,
-        corners[triangle, 2, 0] - ax, corners[triangle, 2, 1] - ay, corners[triangle, 2, 2] - az,
-    )  # fmt: skip
+    chosen = corners[triangle]
+    from_a = minus(row_of(origins, ray), row_of(chosen, 0))
+    return ray_hit(from_a, row_of(directions, ray), edge(chosen, 0, 1), edge(chosen, 0, 2))

@@ -5,8 +5,6 @@ from numba import njit
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
-    corner_gradient,
-    edge,
     spring_length,
     tet_shape,
     volume_ratio,
@@ -14,15 +12,27 @@ from msdm_core.kernels.element_kernels import (
 from msdm_core.kernels.lane_view_kernels import nodes_of
 from msdm_core.kernels.layout_kernels import (
     add_to_node,
+    at_node,
     difference,
     group_width,
     load_column,
     load_item,
     load_shared,
+    set_node,
     store_column,
     take_from_node,
 )
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.space_kernels import (
+    divided,
+    edge,
+    opposite,
+    plus,
+    scalar_product,
+    shifted,
+    times,
+    vector_product,
+)
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 # Implicit stiffness of a steep spring over the rise of its tangent: a larger factor needs fewer sweeps for the fast
@@ -66,8 +76,8 @@ def hold_squeezed(
             ratio = volume_ratio(six, inverse_volume[tet])
             if not ratio < SQUEEZED_RATIO:
                 continue
-            gc, gd = corner_gradient(d, b), corner_gradient(b, c)
-            ga = (-(gb[0] + gc[0] + gd[0]), -(gb[1] + gc[1] + gd[1]), -(gb[2] + gc[2] + gd[2]))
+            gc, gd = vector_product(d, b), vector_product(b, c)
+            ga = opposite(plus(plus(gb, gc), gd))
             gradients = (ga, gb, gc, gd)
             # Six times the rate of the volume after all forces so far, and its change for a tension of 6.
             six_rate = 0.0
@@ -96,8 +106,8 @@ def _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, pull):
     No loop over x, y and z: LLVM would not unroll it here, and would spill the direction of many lanes to the stack.
     """
     for_i, for_j = pull * dt * load_item(lanes, inverse_mass, i), pull * dt * load_item(lanes, inverse_mass, j)
-    add_to_node(lanes, speed, i, for_i * along[0], for_i * along[1], for_i * along[2])
-    take_from_node(lanes, speed, j, for_j * along[0], for_j * along[1], for_j * along[2])
+    add_to_node(lanes, speed, i, times(for_i, along))
+    take_from_node(lanes, speed, j, times(for_j, along))
 
 
 @njit(**INLINED)
@@ -110,19 +120,10 @@ def _direction(lanes, rows, row):
 
 
 @njit(**INLINED)
-def _set_axis(lanes, speed, velocity, force, rate, node, axis):
-    """`_set_speed` along one axis."""
-    after = load_column(lanes, velocity, 3, node, axis) + rate * load_column(lanes, force, 3, node, axis)
-    store_column(lanes, speed, 3, node, axis, after)
-
-
-@njit(**INLINED)
 def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
     """Set the speed of a node after all forces so far."""
     rate = dt * load_item(lanes, inverse_mass, node)
-    _set_axis(lanes, speed, velocity, force, rate, node, 0)
-    _set_axis(lanes, speed, velocity, force, rate, node, 1)
-    _set_axis(lanes, speed, velocity, force, rate, node, 2)
+    set_node(lanes, speed, node, shifted(at_node(lanes, velocity, node), rate, at_node(lanes, force, node)))
 
 
 @njit(**KERNEL)
@@ -158,8 +159,8 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             if not any_below(STEEP_EXCESS - more, 0.0):
                 continue
             largest = keep_lower(more, largest, largest, more)
-            x, y, z = difference(lanes, position, nodes, spring, 1)
-            length = spring_length(x, y, z)
+            along = difference(lanes, position, nodes, spring, 1)
+            along = divided(along, spring_length(along))
             tangent = STEEP_HOLD * load_item(lanes, stiffness, spring) * more
             if relaxes:
                 tangent = tangent * load_shared(lanes, steepness, gain, spring)
@@ -167,9 +168,9 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             tangent = keep_lower(none + STEEP_EXCESS, more, tangent, none)
             give = dt * load_item(lanes, inverse_mass, i) + dt * load_item(lanes, inverse_mass, j)
             places[held] = spring
-            store_column(lanes, rows, STEEP_WIDTH, held, 0, x / length)
-            store_column(lanes, rows, STEEP_WIDTH, held, 1, y / length)
-            store_column(lanes, rows, STEEP_WIDTH, held, 2, z / length)
+            store_column(lanes, rows, STEEP_WIDTH, held, 0, along[0])
+            store_column(lanes, rows, STEEP_WIDTH, held, 1, along[1])
+            store_column(lanes, rows, STEEP_WIDTH, held, 2, along[2])
             store_column(lanes, rows, STEEP_WIDTH, held, 3, tangent * dt)
             store_column(lanes, rows, STEEP_WIDTH, held, 4, 1.0 / (1.0 + tangent * dt * give))
             store_column(lanes, rows, STEEP_WIDTH, held, 5, none)
@@ -188,8 +189,7 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             row = turn if sweep % 2 == 0 else held - 1 - turn
             i, j = nodes[places[row], 0], nodes[places[row], 1]
             along = _direction(lanes, rows, row)
-            x, y, z = difference(lanes, speed, nodes, places[row], 1)
-            rate = along[0] * x + along[1] * y + along[2] * z
+            rate = scalar_product(along, difference(lanes, speed, nodes, places[row], 1))
             pull = load_column(lanes, rows, STEEP_WIDTH, row, 5)
             more = (load_column(lanes, rows, STEEP_WIDTH, row, 3) * rate - pull) * (
                 load_column(lanes, rows, STEEP_WIDTH, row, 4) * goes_on
@@ -198,7 +198,6 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             _change_speeds(lanes, speed, inverse_mass, dt, i, j, along, more)
     for row in range(held):
         i, j = nodes[places[row], 0], nodes[places[row], 1]
-        along, pull = _direction(lanes, rows, row), load_column(lanes, rows, STEEP_WIDTH, row, 5)
-        x, y, z = pull * along[0], pull * along[1], pull * along[2]
-        add_to_node(lanes, force, i, x, y, z)
-        take_from_node(lanes, force, j, x, y, z)
+        pull = times(load_column(lanes, rows, STEEP_WIDTH, row, 5), _direction(lanes, rows, row))
+        add_to_node(lanes, force, i, pull)
+        take_from_node(lanes, force, j, pull)

@@ -10,7 +10,14 @@ import math
 
 from numba import njit
 
-from msdm_core.kernels.contact_kernels import add_contact_forces, find_candidates, hold_contact, stretch_by_lag
+from msdm_core.kernels.contact_kernels import (
+    add_contact_forces,
+    end_of,
+    find_candidates,
+    hold_contact,
+    stretch_by_lag,
+    tool_velocity,
+)
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
 from msdm_core.kernels.lane_view_kernels import (
@@ -30,6 +37,7 @@ from msdm_core.kernels.lane_view_kernels import (
 )
 from msdm_core.kernels.layout_kernels import group_width, load_part, store_part
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.space_kernels import add_to_row, part_of_row, row_of, times, vector_product
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, hold_squeezed, hold_steep
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -71,25 +79,16 @@ def move_shapes(shapes, dt):
     In:  dt [s], shapes: tool_twist [m/s, rad/s] (n_tool, 6), shape_tool (n_shape,)
     Out: shapes: shape_ends [m] (n_shape, 2, 3), shape_span [m] (n_shape, 3), tool_centre [m] (n_tool, 3)
     """
-    twist = shapes.tool_twist
+    twist, spans = shapes.tool_twist, shapes.shape_span
     for shape in range(shapes.shape_radius.shape[0]):
         tool = shapes.shape_tool[shape]
         for end in range(2):
-            ox = shapes.shape_ends[shape, end, 0] - shapes.tool_centre[tool, 0]
-            oy = shapes.shape_ends[shape, end, 1] - shapes.tool_centre[tool, 1]
-            oz = shapes.shape_ends[shape, end, 2] - shapes.tool_centre[tool, 2]
-            shapes.shape_ends[shape, end, 0] += dt * (twist[tool, 0] + twist[tool, 4] * oz - twist[tool, 5] * oy)
-            shapes.shape_ends[shape, end, 1] += dt * (twist[tool, 1] + twist[tool, 5] * ox - twist[tool, 3] * oz)
-            shapes.shape_ends[shape, end, 2] += dt * (twist[tool, 2] + twist[tool, 3] * oy - twist[tool, 4] * ox)
-        sx = shapes.shape_span[shape, 0]
-        sy = shapes.shape_span[shape, 1]
-        sz = shapes.shape_span[shape, 2]
-        shapes.shape_span[shape, 0] += dt * (twist[tool, 4] * sz - twist[tool, 5] * sy)
-        shapes.shape_span[shape, 1] += dt * (twist[tool, 5] * sx - twist[tool, 3] * sz)
-        shapes.shape_span[shape, 2] += dt * (twist[tool, 3] * sy - twist[tool, 4] * sx)
+            speed = tool_velocity(shapes, tool, end_of(shapes, shape, end))
+            add_to_row(shapes.shape_ends[shape], end, times(dt, speed))
+        turning = vector_product(part_of_row(twist, tool, 3), row_of(spans, shape))
+        add_to_row(spans, shape, times(dt, turning))
     for tool in range(shapes.tool_centre.shape[0]):
-        for axis in range(3):
-            shapes.tool_centre[tool, axis] += dt * twist[tool, axis]
+        add_to_row(shapes.tool_centre, tool, times(dt, row_of(twist, tool)))
 
 
 @njit(**INNER)

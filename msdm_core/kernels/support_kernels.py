@@ -7,6 +7,17 @@ from numba import njit
 from msdm_core.kernels.contact_kernels import stick_or_slip
 from msdm_core.kernels.layout_kernels import load_item, load_part, parts_of, store_part, where_moving
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.space_kernels import (
+    add_to_row,
+    divided,
+    length_of,
+    minus,
+    row_of,
+    scalar_product,
+    set_row,
+    shifted,
+    times,
+)
 from msdm_core.kernels.vector_kernels import load_row
 
 PLANE, SPHERE, CAPSULE, BOX = 0, 1, 2, 3
@@ -31,50 +42,35 @@ def add_support_forces(model, ground, position, velocity, force, stretch, load, 
     stiffness, damping, across = model.support_stiffness, model.support_damping, model.support_tangential_stiffness
     for support in range(kinds.shape[0]):
         kind, friction = kinds[support], frictions[support]
-        cx, cy, cz = ground[support, 0, 0], ground[support, 0, 1], ground[support, 0, 2]
+        place, speed, lengths = row_of(ground[support], 0), row_of(ground[support], 1), row_of(size, support)
         load[support] = 0.0
-        ax, ay, az = rotation[support, 0, 0], rotation[support, 1, 0], rotation[support, 2, 0]
-        bx, by, bz = rotation[support, 0, 1], rotation[support, 1, 1], rotation[support, 2, 1]
-        ex, ey, ez = rotation[support, 0, 2], rotation[support, 1, 2], rotation[support, 2, 2]
-        first, second, third = size[support, 0], size[support, 1], size[support, 2]
+        a, b, c = _column(rotation[support], 0), _column(rotation[support], 1), _column(rotation[support], 2)
         for item in range(nodes.shape[0]):
             node = nodes[item]
-            ox = position[node, 0] - cx
-            oy = position[node, 1] - cy
-            oz = position[node, 2] - cz
-            x = ax * ox + ay * oy + az * oz
-            y = bx * ox + by * oy + bz * oz
-            z = ex * ox + ey * oy + ez * oz
-            depth, lx, ly, lz = depth_inside(kind, first, second, third, x, y, z)
+            offset = minus(row_of(position, node), place)
+            inside = (scalar_product(a, offset), scalar_product(b, offset), scalar_product(c, offset))
+            depth, out = depth_inside(kind, lengths, inside)
             if depth <= 0.0:
-                stretch[item, support, 0] = 0.0
-                stretch[item, support, 1] = 0.0
-                stretch[item, support, 2] = 0.0
+                for axis in range(3):
+                    stretch[item, support, axis] = 0.0
                 continue
-            nx = ax * lx + bx * ly + ex * lz
-            ny = ay * lx + by * ly + ey * lz
-            nz = az * lx + bz * ly + ez * lz
-            vx = velocity[node, 0] - ground[support, 1, 0]
-            vy = velocity[node, 1] - ground[support, 1, 1]
-            vz = velocity[node, 2] - ground[support, 1, 2]
-            pressure = stiffness * depth - damping * (nx * vx + ny * vy + nz * vz)
+            normal = shifted(shifted(times(out[0], a), out[1], b), out[2], c)
+            relative = minus(row_of(velocity, node), speed)
+            pressure = stiffness * depth - damping * scalar_product(normal, relative)
             if pressure < 0.0:
                 pressure = 0.0
-            ux, uy, uz = stretch[item, support, 0], stretch[item, support, 1], stretch[item, support, 2]
-            ux, uy, uz = stick_or_slip(ux, uy, uz, vx, vy, vz, dt, nx, ny, nz, friction * pressure / across)
-            stretch[item, support, 0] = ux
-            stretch[item, support, 1] = uy
-            stretch[item, support, 2] = uz
-            area = areas[item]
-            x = area * (pressure * nx - across * ux)
-            y = area * (pressure * ny - across * uy)
-            z = area * (pressure * nz - across * uz)
-            force[node, 0] += x
-            force[node, 1] += y
-            force[node, 2] += z
-            load[support, 0] += x
-            load[support, 1] += y
-            load[support, 2] += z
+            longest = friction * pressure / across
+            moved = stick_or_slip(row_of(stretch[item], support), relative, dt, normal, longest)
+            set_row(stretch[item], support, 0, moved)
+            push = times(areas[item], minus(times(pressure, normal), times(across, moved)))
+            add_to_row(force, node, push)
+            add_to_row(load, support, push)
+
+
+@njit(**INLINED)
+def _column(matrix, column):
+    """A column of a matrix (3, 3)."""
+    return matrix[0, column], matrix[1, column], matrix[2, column]
 
 
 @njit(**KERNEL)
@@ -86,13 +82,9 @@ def add_foundation_forces(nodes, ground, stiffness, position, force):
     """
     for item in range(nodes.shape[0]):
         node = nodes[item]
-        x = position[node, 0] - ground[item, 0]
-        y = position[node, 1] - ground[item, 1]
-        z = position[node, 2] - ground[item, 2]
+        stretch = minus(row_of(position, node), row_of(ground, item))
         for axis in range(3):
-            force[node, axis] -= (
-                stiffness[item, axis, 0] * x + stiffness[item, axis, 1] * y + stiffness[item, axis, 2] * z
-            )
+            force[node, axis] -= scalar_product(row_of(stiffness[item], axis), stretch)
 
 
 @njit(**KERNEL)
@@ -216,29 +208,30 @@ def move_ground(model, position, force, foundation, load, motion, dt):
 
 
 @njit(**INNER)
-def depth_inside(kind, first, second, third, x, y, z):
+def depth_inside(kind, size, point):
     """Depth of a point in a solid, and the outward normal, in the frame of the solid.
 
     In a box the normal is that of the nearest face; at the centre of a sphere or on the axis of a capsule it is x.
 
-    In: kind: PLANE, SPHERE, CAPSULE or BOX; first, second, third: radius, half length, half sizes [m]; x, y, z [m]
-    Returns the depth [m], at most 0 outside, and the three components of the unit normal.
+    In: kind: PLANE, SPHERE, CAPSULE or BOX; size: radius, half length, half sizes [m]; point [m]
+    Returns the depth [m], at most 0 outside, and the unit normal.
     """
+    x, y, z = point
     if kind == PLANE:
-        return -z, 0.0, 0.0, 1.0
+        return -z, (0.0, 0.0, 1.0)
     if kind == BOX:
         # Distances to the nearer of two faces.
-        dx = first - abs(x)
-        dy = second - abs(y)
-        dz = third - abs(z)
+        dx = size[0] - abs(x)
+        dy = size[1] - abs(y)
+        dz = size[2] - abs(z)
         if dz <= dx and dz <= dy:
-            return dz, 0.0, 0.0, math.copysign(1.0, z)
+            return dz, (0.0, 0.0, math.copysign(1.0, z))
         if dy <= dx:
-            return dy, 0.0, math.copysign(1.0, y), 0.0
-        return dx, math.copysign(1.0, x), 0.0, 0.0
+            return dy, (0.0, math.copysign(1.0, y), 0.0)
+        return dx, (math.copysign(1.0, x), 0.0, 0.0)
     if kind == CAPSULE:
-        z -= min(second, max(-second, z))
-    distance = math.sqrt(x * x + y * y + z * z)
+        z -= min(size[1], max(-size[1], z))
+    distance = length_of((x, y, z))
     if distance == 0.0:
-        return first, 1.0, 0.0, 0.0
-    return first - distance, x / distance, y / distance, z / distance
+        return size[0], (1.0, 0.0, 0.0)
+    return size[0] - distance, divided((x, y, z), distance)

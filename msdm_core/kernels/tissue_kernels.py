@@ -11,7 +11,6 @@ from numba import njit
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
-    corner_gradient,
     node_law,
     node_tension,
     six_rates,
@@ -55,6 +54,7 @@ from msdm_core.kernels.layout_kernels import (
     where_moving,
 )
 from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.space_kernels import minus, plus, times, vector_product
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 
@@ -102,11 +102,10 @@ def put_back(lanes, state):
 
 
 @njit(**INLINED)
-def _pull_ends(lanes, force, nodes, spring, x, y, z, scale):
-    """Pull the ends of a spring together with `scale` times the vector between them."""
-    x, y, z = x * scale, y * scale, z * scale
-    add_to_node(lanes, force, nodes[spring, 0], x, y, z)
-    take_from_node(lanes, force, nodes[spring, 1], x, y, z)
+def _pull_ends(lanes, force, nodes, spring, pull):
+    """Pull the ends of a spring together."""
+    add_to_node(lanes, force, nodes[spring, 0], pull)
+    take_from_node(lanes, force, nodes[spring, 1], pull)
 
 
 @njit(**INLINED)
@@ -126,17 +125,17 @@ def _keep_length(lanes, lengths, spring, length):
 
 
 @njit(**INLINED)
-def _kept_length(lanes, lengths, spring, x, y, z):
+def _kept_length(lanes, lengths, spring, along):
     """Length of a spring, kept or computed again."""
     if len(lanes) == 0:
         return lengths[spring]
-    return spring_length(x, y, z)
+    return spring_length(along)
 
 
 @njit(**INLINED)
 def _measure(lanes, position, lengths, item, stiffness, rest_length, edge):
     """Keep the length of a spring along an edge; returns its `spring_energy`."""
-    length = spring_length(edge[0], edge[1], edge[2])
+    length = spring_length(edge)
     _keep_length(lanes, lengths, item, length)
     return spring_energy(length, load_shared(lanes, position, rest_length, item), load_item(lanes, stiffness, item))
 
@@ -247,11 +246,11 @@ def add_spring_forces(lanes, model, state, law):
         first, steep_count = add_spring_groups(model, state, law)
     width = group_width(lanes)
     for spring in range(first, nodes.shape[0]):
-        x, y, z = difference(lanes, position, nodes, spring, 1)
+        along = difference(lanes, position, nodes, spring, 1)
         if model.stiffens:
-            length = _kept_length(lanes, lengths, spring, x, y, z)
+            length = _kept_length(lanes, lengths, spring, along)
         else:
-            length = spring_length(x, y, z)
+            length = spring_length(along)
         share = load_shared(lanes, position, rest_length, spring) / length
         rigidity = load_item(lanes, stiffness, spring)
         scale = spring_scale(share, rigidity)
@@ -270,7 +269,7 @@ def add_spring_forces(lanes, model, state, law):
                 load_shared(lanes, position, model.spring_gain, spring), load_item(lanes, state.spring_relief, spring)
             )  # fmt: skip
             scale = scale * gain - relief * share
-        _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
+        _pull_ends(lanes, force, nodes, spring, times(scale, along))
     return steep_count
 
 
@@ -280,10 +279,9 @@ def add_spring_damping(lanes, model, state):
     position, velocity, force = nodes_of(lanes, state)
     nodes, stiffness, beta = model.spring_nodes, model.spring_stiffness, model.beta
     for spring in range(nodes.shape[0]):
-        x, y, z = difference(lanes, position, nodes, spring, 1)
-        vx, vy, vz = difference(lanes, velocity, nodes, spring, 1)
-        scale = spring_drag(x, y, z, vx, vy, vz, load_item(lanes, stiffness, spring), beta)
-        _pull_ends(lanes, force, nodes, spring, x, y, z, scale)
+        along, rate = difference(lanes, position, nodes, spring, 1), difference(lanes, velocity, nodes, spring, 1)
+        scale = spring_drag(along, rate, load_item(lanes, stiffness, spring), beta)
+        _pull_ends(lanes, force, nodes, spring, times(scale, along))
 
 
 @njit(**INNER)
@@ -340,20 +338,16 @@ def add_volume_rates(lanes, model, state):
 
 @njit(**INLINED)
 def _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b):
-    """Add the forces of a tet on its corners: `scale` times `corner_gradient`, at b `at_b`.
+    """Add the forces of a tet on its corners: `scale` times six times the gradient of its volume, at b `at_b`.
 
     Corner by corner: all gradients at once do not fit into 16 registers.
     """
-    x, y, z = at_b
-    add_to_node(lanes, force, tets[tet, 1], x, y, z)
-    g = corner_gradient(d, b)
-    gx, gy, gz = scale * g[0], scale * g[1], scale * g[2]
-    add_to_node(lanes, force, tets[tet, 2], gx, gy, gz)
-    x, y, z = x + gx, y + gy, z + gz
-    g = corner_gradient(b, c)
-    gx, gy, gz = scale * g[0], scale * g[1], scale * g[2]
-    add_to_node(lanes, force, tets[tet, 3], gx, gy, gz)
-    take_from_node(lanes, force, tets[tet, 0], x + gx, y + gy, z + gz)
+    add_to_node(lanes, force, tets[tet, 1], at_b)
+    at_c = times(scale, vector_product(d, b))
+    add_to_node(lanes, force, tets[tet, 2], at_c)
+    at_d = times(scale, vector_product(b, c))
+    add_to_node(lanes, force, tets[tet, 3], at_d)
+    take_from_node(lanes, force, tets[tet, 0], plus(plus(at_b, at_c), at_d))
 
 
 @njit(**INNER)
@@ -390,9 +384,9 @@ def add_tet_forces(lanes, model, state, law, steep_count):
                 count += 1
         if model.stiffens:
             averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
-            length = _kept_length(lanes, lengths, tet, b[0], b[1], b[2])
+            length = _kept_length(lanes, lengths, tet, b)
         else:
-            averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(b[0], b[1], b[2])
+            averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(b)
         bulk, averaged_bulk = load_item(lanes, model.tet_bulk, tet), load_item(lanes, model.tet_averaged_bulk, tet)
         scale = tet_scale(ratio, bulk, averaged_bulk, averaged)
         share = load_shared(lanes, position, rest_length, tet) / length
@@ -413,9 +407,7 @@ def add_tet_forces(lanes, model, state, law, steep_count):
                 load_shared(lanes, position, model.spring_gain, tet), load_item(lanes, state.spring_relief, tet)
             )  # fmt: skip
             pull = pull * gain - relief * share
-        at_b = (
-            scale * gradient[0] - pull * b[0], scale * gradient[1] - pull * b[1], scale * gradient[2] - pull * b[2]
-        )  # fmt: skip
+        at_b = minus(times(scale, gradient), times(pull, b))
         _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b)
     store_item(lanes, low, 0, where_moving(lanes, state.moving, lowest, load_item(lanes, low, 0)))
     return count, steep_count
@@ -431,5 +423,4 @@ def add_volume_damping(lanes, model, state):
         six_rate = six_rates(b, c, d, *three_edges(lanes, velocity, tets, tet))
         rate = beta * volume_ratio(six_rate, load_shared(lanes, position, inverse_volume, tet))
         scale = load_item(lanes, bulk, tet) * rate * (-1.0 / 6.0)
-        g = corner_gradient(c, d)
-        _push_corners(lanes, force, tets, tet, scale, b, c, d, (scale * g[0], scale * g[1], scale * g[2]))
+        _push_corners(lanes, force, tets, tet, scale, b, c, d, times(scale, vector_product(c, d)))

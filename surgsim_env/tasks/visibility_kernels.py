@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from msdm_core.kernels.option_kernels import INNER, KERNEL
 from msdm_core.kernels.ray_kernels import ray_hit
+from msdm_core.kernels.space_kernels import edge, minus, row_of, scalar_product
 
 FloatArray = NDArray[np.float64]
 
@@ -35,20 +36,17 @@ def hide_behind_triangles(eye, points, axis, cosine, sine, reach, position, tria
     Out: hidden (n,): 1 where a way meets one
     """
     for triangle in range(triangles.shape[0]):
-        a, b, c = triangles[triangle, 0], triangles[triangle, 1], triangles[triangle, 2]
-        ax, ay, az = position[a, 0], position[a, 1], position[a, 2]
-        ux, uy, uz = position[b, 0] - ax, position[b, 1] - ay, position[b, 2] - az
-        vx, vy, vz = position[c, 0] - ax, position[c, 1] - ay, position[c, 2] - az
+        a, b, c = row_of(triangles, triangle)
+        first, ab, ac = row_of(position, a), edge(position, a, b), edge(position, a, c)
         # A ball about corner a that holds the triangle.
-        size = math.sqrt(max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz))
-        if not _near_cone(ax, ay, az, size, eye, axis, cosine, sine, reach):
+        size = math.sqrt(max(scalar_product(ab, ab), scalar_product(ac, ac)))
+        if not _near_cone(first[0], first[1], first[2], size, eye, axis, cosine, sine, reach):
             continue
-        tx, ty, tz = eye[0] - ax, eye[1] - ay, eye[2] - az
+        from_a = minus(eye, first)
         for point in range(points.shape[0]):
             if hidden[point]:
                 continue
-            dx, dy, dz = points[point, 0] - eye[0], points[point, 1] - eye[1], points[point, 2] - eye[2]
-            if 0.0 < ray_hit(tx, ty, tz, dx, dy, dz, ux, uy, uz, vx, vy, vz) < 1.0:
+            if 0.0 < ray_hit(from_a, minus(row_of(points, point), eye), ab, ac) < 1.0:
                 hidden[point] = 1
 
 

@@ -132,11 +132,11 @@ def pull_force(jaws, wrench):
     """Largest size of the sum of the forces on the two fingers of a jaw [N], over all jaws (n_jaw, 2)."""
     largest = 0.0
     for jaw in range(jaws.shape[0]):
-        one, other = jaws[jaw, 0], jaws[jaw, 1]
+        first, second = jaws[jaw, 0], jaws[jaw, 1]
         x, y, z = (
-            wrench[one, 0] + wrench[other, 0],
-            wrench[one, 1] + wrench[other, 1],
-            wrench[one, 2] + wrench[other, 2],
+            wrench[first, 0] + wrench[second, 0],
+            wrench[first, 1] + wrench[second, 1],
+            wrench[first, 2] + wrench[second, 2],
         )
         largest = max(largest, math.sqrt(x * x + y * y + z * z))
     return largest

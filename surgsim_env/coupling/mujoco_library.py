@@ -20,13 +20,13 @@ LIBRARY_NAMES = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
 
 def load_library(folder: Path) -> str:
     """Load the library in MuJoCo's package folder into the linker; returns why it cannot be used, or ""."""
-    found = sorted(path for name in LIBRARY_NAMES for path in folder.glob(name))
-    if not found:
+    libraries = sorted(path for name in LIBRARY_NAMES for path in folder.glob(name))
+    if not libraries:
         return f"no library of MuJoCo in {folder} ({', '.join(LIBRARY_NAMES)})"
     try:
-        binding.load_library_permanently(str(found[0]))
+        binding.load_library_permanently(str(libraries[0]))
     except RuntimeError as error:
-        return f"{found[0]} cannot be loaded: {error}"
+        return f"{libraries[0]} cannot be loaded: {error}"
     return check_functions(MUJOCO_FUNCTIONS)
 
 

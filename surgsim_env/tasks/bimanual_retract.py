@@ -222,7 +222,7 @@ class BimanualRetractTask(RetractTask):
         return self.grasp.holds and self.uncovered_share >= SUCCESS_SHARE and self.touches(simulation)
 
     def touches(self, simulation: Simulation) -> bool:
-        """Whether the right ball is above the disc and presses what lies under it with TOUCH_FORCE."""
+        """True if the right ball is above the disc and presses on it with TOUCH_FORCE."""
         x, y, height = self._from_target(simulation)
         above = math.hypot(x, y) <= self.table.target_radius and float(height) <= TOUCH_GAP
         return above and TOUCH_FORCE[0] <= self.touch_force <= TOUCH_FORCE[1]

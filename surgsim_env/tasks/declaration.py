@@ -216,26 +216,34 @@ def table(heading: str, rows: Sequence[Sequence[object]]) -> str:
 def action_table(task_class: Any) -> str:
     """Commands of a task: size, meaning, full scale."""
     rows = []
-    for one in task_class.commands:
-        scale = f"{one.scale:g} {one.unit}".strip() if one.unit else ""
-        rows.append((f"`{one.name}`", _size_shown(one), one.meaning, scale))
+    for command in task_class.commands:
+        scale = f"{command.scale:g} {command.unit}".strip() if command.unit else ""
+        rows.append((f"`{command.name}`", _size_shown(command), command.meaning, scale))
     return table("command, size, meaning, full scale", rows)
 
 
 def observation_table(task_class: Any) -> str:
     """Channels of a task: size, meaning with unit, bounds, scale; then those that `observe_force=False` hides."""
     rows = []
-    for one in task_class.channels:
-        unit = f" [{one.unit}]" if one.unit else ""
-        rows.append((f"`{one.name}`", _size_shown(one), one.meaning + unit, one.bounds_shown, one.scale_shown))
-    felt = ", ".join(f"`{one.name}`" for one in task_class.channels if one.felt)
+    for channel in task_class.channels:
+        unit = f" [{channel.unit}]" if channel.unit else ""
+        rows.append(
+            (
+                f"`{channel.name}`",
+                _size_shown(channel),
+                channel.meaning + unit,
+                channel.bounds_shown,
+                channel.scale_shown,
+            )
+        )
+    felt = ", ".join(f"`{channel.name}`" for channel in task_class.channels if channel.felt)
     note = f"\n\nWith `observe_force=False` these are observed as 0: {felt}." if felt else ""
     return table("channel, size, meaning, bounds, scale", rows) + SCALED + note
 
 
 def reward_table(task_class: Any) -> str:
     """Reward terms of a task: weight, what it is paid for, meaning."""
-    rows = [(f"`{one.name}`", f"{one.weight:g}", PERIODS[one.per], one.meaning) for one in task_class.rewards]
+    rows = [(f"`{term.name}`", f"{term.weight:g}", PERIODS[term.per], term.meaning) for term in task_class.rewards]
     return table("term, weight, paid per, meaning", rows)
 
 
@@ -254,9 +262,9 @@ def documentation(task_class: Any) -> str:
     box = {"Action Space": "`Box(-1, 1, float32)`", "Observation Space": "`Box(float32)`, all bounds finite"}
     first = f"* `scene`: the name or file of a scene; default {task_class.setup.scene!r}.\n* `instrument`: likewise."
     for heading, text in filled.items():
-        told = sections.get(heading) or {**box, "Arguments": first}.get(heading, "")
-        sections[heading] = f"{told}\n{text}".strip() if heading == "Arguments" else f"{told}\n\n{text}".strip()
-    order = sorted(sections, key=lambda one: HEADINGS.index(one) if one in HEADINGS else len(HEADINGS))
+        own = sections.get(heading) or {**box, "Arguments": first}.get(heading, "")
+        sections[heading] = f"{own}\n{text}".strip() if heading == "Arguments" else f"{own}\n\n{text}".strip()
+    order = sorted(sections, key=lambda heading: HEADINGS.index(heading) if heading in HEADINGS else len(HEADINGS))
     return "\n\n".join([summary, *(f"## {heading}\n{sections[heading]}" for heading in order)])
 
 

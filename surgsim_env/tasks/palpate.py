@@ -74,7 +74,7 @@ def _tip_radius(task: "PalpateTask", instrument: Instrument | None) -> float:
 
 
 def _step_weight(task: "PalpateTask", step: ControlStep) -> float:
-    """What a control step counts: episodes of any length cost alike, and finding a lesion always pays."""
+    """Weight of a control step: episodes of any length cost alike, and a lesion's detection always pays."""
     assert task.episode_steps is not None
     return EPISODE_STEPS / task.episode_steps
 

@@ -350,7 +350,7 @@ class PalpateSitesTask(Task):
 
     @property
     def record(self) -> dict[str, Any]:
-        """What was felt and the sensor's bias, as a table for JSON."""
+        """Record of the readings and the sensor's bias, as a table for JSON."""
         return {"bias": self.reading.get_state(), **self.felt.get_state()}
 
     @record.setter

@@ -390,7 +390,7 @@ class RetractTask(Task):
         return "hard_force" if step.force_peak > self.limits.hard_force else ""
 
     def at_goal(self, simulation: Simulation) -> bool:
-        """Whether the state is the one that has to last for SUCCESS_TIME."""
+        """True in a state of success, to be held for SUCCESS_TIME."""
         return self.visible_share >= SUCCESS_SHARE
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
@@ -579,7 +579,7 @@ class RetractionRecord:
         if self.tip is not None:
             self.path += float(norm(tip - self.tip))
         self.tip = tip.tolist()
-        self.strain = [max(one, other) for one, other in zip(self.strain, strain)]
+        self.strain = [max(pair) for pair in zip(self.strain, strain)]
 
     def info(self) -> dict[str, bool | float | str]:
         """The measures so far, by the names that `info` has."""

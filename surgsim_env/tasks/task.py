@@ -139,7 +139,7 @@ class Task:
             "force_peak": peak,
             "cost": 0.0 if step is None else max(self.limits.excess(peak), 0.0),
             "hard_limit": end == "hard_force",
-            "success": end == "success" or any(one.name == end for one in self.rewards if one.per == "success"),
+            "success": end == "success" or any(term.name == end for term in self.rewards if term.per == "success"),
         }
 
     @property

@@ -1,4 +1,4 @@
-"""How much of a target an eye sees past an organ's surface and an instrument: rays to points, no picture."""
+"""Visibility of a target past an organ's surface and an instrument: rays to points, no picture."""
 
 import math
 from dataclasses import dataclass, replace
@@ -76,7 +76,7 @@ def visible(
     data: mujoco.MjData,
     geoms: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
-    """Which points are seen from an eye.
+    """Visibility of points from an eye.
 
     Args:
         eye: where the camera stands [m], (3,).
@@ -99,7 +99,7 @@ def visible(
 
 
 def uncovered(eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray) -> NDArray[np.bool_]:
-    """Which points are seen from an eye past triangles alone; arguments and result as those of `visible`."""
+    """Visibility of points from an eye past triangles alone; arguments and result as those of `visible`."""
     return _hidden_by(eye, points, node_position, triangles)[0] == 0
 
 

@@ -1,4 +1,4 @@
-"""What hides points from an eye: triangles of a surface and MuJoCo's primitive shapes, ray by ray."""
+"""Occlusion of points by triangles of a surface and MuJoCo's primitive shapes, ray by ray."""
 
 import math
 
@@ -18,7 +18,7 @@ PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _near_cone(x, y, z, radius, eye, axis, cosine, sine, reach):
-    """Whether a ball comes into the cone from an eye along a unit axis, no farther than `reach` [m]."""
+    """True if a ball comes into the cone from an eye along a unit axis, no farther than `reach` [m]."""
     x, y, z = x - eye[0], y - eye[1], z - eye[2]
     along = x * axis[0] + y * axis[1] + z * axis[2]
     if along < -radius or along > reach + radius:
@@ -52,7 +52,7 @@ def hide_behind_triangles(eye, points, axis, cosine, sine, reach, position, tria
 
 @njit(**INNER)
 def _meets_ball(x, y, z, dx, dy, dz):
-    """Whether the segment from (x, y, z) by (dx, dy, dz) meets the unit ball."""
+    """True if the segment from (x, y, z) by (dx, dy, dz) meets the unit ball."""
     a = dx * dx + dy * dy + dz * dz
     b = x * dx + y * dy + z * dz
     square = b * b - a * (x * x + y * y + z * z - 1.0)
@@ -64,7 +64,7 @@ def _meets_ball(x, y, z, dx, dy, dz):
 
 @njit(**INNER)
 def _meets_slabs(x, y, z, dx, dy, dz, size, first, low, high):
-    """Whether the part from `low` to `high` of a segment meets the slabs |coordinate| < size, from axis `first` on."""
+    """True if the part from `low` to `high` of a segment meets the slabs |coordinate| < size, from axis `first` on."""
     for axis in range(first, 3):
         start = x if axis == 0 else (y if axis == 1 else z)
         way = dx if axis == 0 else (dy if axis == 1 else dz)
@@ -79,7 +79,7 @@ def _meets_slabs(x, y, z, dx, dy, dz, size, first, low, high):
 
 @njit(**INNER)
 def _meets_cylinder(x, y, z, dx, dy, dz, radius, half_length, limits):
-    """Whether a segment meets the cylinder about z; `limits` (3,) is scratch."""
+    """True if a segment meets the cylinder about z; `limits` (3,) is scratch."""
     a = dx * dx + dy * dy
     b = x * dx + y * dy
     c = x * x + y * y - radius * radius
@@ -99,7 +99,7 @@ def _meets_cylinder(x, y, z, dx, dy, dz, radius, half_length, limits):
 
 @njit(**INNER)
 def _meets_shape(kind, size, x, y, z, dx, dy, dz, limits):
-    """Whether a segment, in the shape's own frame, meets one of MuJoCo's shapes."""
+    """True if a segment, in the shape's own frame, meets one of MuJoCo's shapes."""
     if kind == PLANE:
         return z * (z + dz) < 0.0
     if kind == BOX:

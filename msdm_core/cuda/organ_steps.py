@@ -37,8 +37,6 @@ from msdm_core.kernels.contact_kernels import (
 )  # fmt: skip
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
-    corner_gradient,
-    edge,
     node_tension,
     spring_length,
     spring_scale,
@@ -48,6 +46,20 @@ from msdm_core.kernels.element_kernels import (
 )  # fmt: skip
 from msdm_core.kernels.guard_kernels import FAR, guard_axes, near_axis, watched_distance
 from msdm_core.kernels.lane_view_kernels import SurfaceView, TouchedView
+from msdm_core.kernels.space_kernels import (
+    add_to_row,
+    edge,
+    minus,
+    part_of_row,
+    plus,
+    row_of,
+    scalar_product,
+    set_row,
+    shifted,
+    take_from_row,
+    times,
+    vector_product,
+)  # fmt: skip
 from msdm_core.kernels.squeeze_kernels import hold_squeezed
 from msdm_core.kernels.structure_kernels import (
     FAULT_CONTACT_LOST,
@@ -212,13 +224,17 @@ def _wait(grid):
 # ---- tissue -------------------------------------------------------------------------------------------------------
 
 
+def _six_volumes(model, work, tet):
+    """Six times the volume of a tet."""
+    a, b, c, d = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1], model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
+    _, six = tet_shape(edge(work.position, a, b), edge(work.position, a, c), edge(work.position, a, d))
+    return six
+
+
 def _set_volumes(first, stride, model, work):
     """Six times the volume of each tet."""
     for tet in range(first, model.tet_nodes.shape[0], stride):
-        a, b = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1]
-        c, d = model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
-        _, six = tet_shape(edge(work.position, a, b), edge(work.position, a, c), edge(work.position, a, d))
-        work.tet[tet] = six
+        work.tet[tet] = _six_volumes(model, work, tet)
 
 
 def _set_tensions(first, stride, model, lane, work):
@@ -247,8 +263,8 @@ def _set_scales(first, stride, model, lane, work, flags, lowest):
         )  # fmt: skip
         work.tet[tet] = tet_scale(ratio, model.tet_bulk[lane, tet], model.tet_averaged_bulk[lane, tet], averaged)
     for spring in range(first, model.spring_nodes.shape[0], stride):
-        x, y, z = edge(work.position, model.spring_nodes[spring, 0], model.spring_nodes[spring, 1])
-        share = model.spring_rest_length[spring] / spring_length(x, y, z)
+        along = edge(work.position, model.spring_nodes[spring, 0], model.spring_nodes[spring, 1])
+        share = model.spring_rest_length[spring] / spring_length(along)
         work.spring[spring] = spring_scale(share, model.spring_stiffness[lane, spring])
     return lowest
 
@@ -257,39 +273,25 @@ def _set_forces(first, stride, model, lane, work):
     """Gravity, volume terms, springs and foundations, node by node."""
     position = work.position
     for node in range(first, position.shape[0], stride):
-        fx, fy, fz = REAL(0.0), REAL(0.0), REAL(0.0)
+        force = (REAL(0.0), REAL(0.0), REAL(0.0))
         for slot in range(model.node_tet_count[node]):
             p = model.node_tets[slot, node, 1]
             # The gradient at a corner is the product of two edges of the opposite face.
-            g = corner_gradient(
+            gradient = vector_product(
                 edge(position, p, model.node_tets[slot, node, 2]), edge(position, p, model.node_tets[slot, node, 3])
             )
-            scale = work.tet[model.node_tets[slot, node, 0]]
-            fx += scale * g[0]
-            fy += scale * g[1]
-            fz += scale * g[2]
+            force = shifted(force, work.tet[model.node_tets[slot, node, 0]], gradient)
         for slot in range(model.node_spring_count[node]):
-            x, y, z = edge(position, node, model.node_springs[slot, node, 1])
-            scale = work.spring[model.node_springs[slot, node, 0]]
-            fx += scale * x
-            fy += scale * y
-            fz += scale * z
-        mass = model.node_mass[lane, node]
-        fx += mass * model.gravity[0]
-        fy += mass * model.gravity[1]
-        fz += mass * model.gravity[2]
+            along = edge(position, node, model.node_springs[slot, node, 1])
+            force = shifted(force, work.spring[model.node_springs[slot, node, 0]], along)
+        gravity = (model.gravity[0], model.gravity[1], model.gravity[2])
+        set_row(work.force, node, 0, shifted(force, model.node_mass[lane, node], gravity))
         held = model.node_foundation[node]
         if held >= 0:
-            stiffness = model.foundation_stiffness
-            x = position[node, 0] - model.foundation_position[held, 0]
-            y = position[node, 1] - model.foundation_position[held, 1]
-            z = position[node, 2] - model.foundation_position[held, 2]
-            fx -= stiffness[held, 0, 0] * x + stiffness[held, 0, 1] * y + stiffness[held, 0, 2] * z
-            fy -= stiffness[held, 1, 0] * x + stiffness[held, 1, 1] * y + stiffness[held, 1, 2] * z
-            fz -= stiffness[held, 2, 0] * x + stiffness[held, 2, 1] * y + stiffness[held, 2, 2] * z
-        work.force[node, 0] = fx
-        work.force[node, 1] = fy
-        work.force[node, 2] = fz
+            stretch = minus(row_of(position, node), row_of(model.foundation_position, held))
+            for axis in range(3):
+                stiffness = row_of(model.foundation_stiffness[held], axis)
+                work.force[node, axis] -= scalar_product(stiffness, stretch)
 
 
 def _integrate(first, stride, model, lane, work, numbers, flags):
@@ -352,16 +354,16 @@ def _find_candidates(model, engaged, shapes, position, duration, block, scratch)
     """Broad phase of a haptic step: triangles in reach of each shape, in order, and the nodes around them."""
     candidates, entry, listed = scratch.candidates[block], scratch.entry[block], scratch.listed[block]
     counts, touched, flags = scratch.counts[block], scratch.touched[block], scratch.flags[block]
-    surface, ends, spans = model.surface_triangles, shapes.shape_ends, shapes.shape_span
+    surface = model.surface_triangles
     begin, end = _share(surface.shape[0])
     base = 0
     for shape in range(shapes.shape_radius.shape[0]):
-        radius, margin = shapes.shape_radius[shape], reach_margin(shapes, shape, duration)
-        box = core_box(ends, spans, shape, radius + margin)
+        margin = reach_margin(shapes, shape, duration)
+        box = core_box(shapes, shape, margin)
         own = 0
         for triangle in range(begin, end):
             entry[shape, triangle] = -1
-            if is_in_reach(position, surface, engaged, ends, spans, shape, triangle, radius, margin, box):
+            if is_in_reach(position, surface, engaged, shapes, shape, triangle, margin, box):
                 entry[shape, triangle] = own
                 own += 1
         before, total = _places(counts, own)
@@ -404,12 +406,11 @@ def _is_touched(model, entry, item):
 def _press(model, work, engaged, stretch, shapes, law, dt, block, scratch):
     """Pressure and friction of each point of the candidates, see `contact_kernels.add_contact_forces`."""
     listed, rows, places = scratch.listed[block], scratch.rows[block], scratch.places[block]
-    surface, ends, spans = model.surface_triangles, shapes.shape_ends, shapes.shape_span
+    surface = model.surface_triangles
     for slot in range(cuda.threadIdx.x, QUADRATURE_COUNT * scratch.flags[block, ENTRY_COUNT], cuda.blockDim.x):
         shape, triangle = listed[slot // QUADRATURE_COUNT, 0], listed[slot // QUADRATURE_COUNT, 1]
         places[slot, 0] = -1
-        radius = shapes.shape_radius[shape]
-        if not may_meet(work.position, surface, engaged, ends, spans, shape, triangle, radius):
+        if not may_meet(work.position, surface, engaged, shapes, shape, triangle):
             continue
         facet = facet_of(work.position, surface, triangle)
         if press_point(
@@ -427,7 +428,7 @@ def _push_nodes(model, work, law, dt, sweep, block, scratch):
     for number in range(cuda.threadIdx.x, scratch.flags[block, NODE_COUNT], cuda.blockDim.x):
         item = touched[number]
         node = model.surface_nodes[item]
-        fx, fy, fz, held = REAL(0.0), REAL(0.0), REAL(0.0), REAL(0.0)
+        force, held = (REAL(0.0), REAL(0.0), REAL(0.0)), REAL(0.0)
         for place in range(model.facet_count[item]):
             triangle, corner = model.facets[item, place] // 3, model.facets[item, place] % 3
             for shape in range(entry.shape[0]):
@@ -439,17 +440,12 @@ def _push_nodes(model, work, law, dt, sweep, block, scratch):
                         continue
                     weight = QUADRATURE_BARYCENTRIC[point, corner]
                     if sweep < 0:
-                        push, ux, uy, uz = first_push(rows, slot, law)
+                        push, drag = first_push(rows, slot, law)
                         held += hold_share(rows, slot, corner, weight, along, across, dt)
                     else:
-                        push, ux, uy, uz = more_push(rows, slot, law)
-                    x, y, z = corner_force(rows, slot, corner, push, weight, ux, uy, uz)
-                    fx += x
-                    fy += y
-                    fz += z
-        work.force[node, 0] += fx
-        work.force[node, 1] += fy
-        work.force[node, 2] += fz
+                        push, drag = more_push(rows, slot, law)
+                    force = plus(force, corner_force(rows, slot, corner, push, weight, drag))
+        add_to_row(work.force, node, force)
         if sweep < 0:
             hold[node] = held
     cuda.syncthreads()
@@ -508,23 +504,15 @@ def _add_wrench(work, shapes, law, reference, wrench, block, scratch, sums):
             if places[slot, 0] < 0 or shapes.shape_tool[places[slot, 0]] != tool:
                 continue
             push = rows[slot, ROW_AREA] * (rows[slot, ROW_PRESSURE] + rows[slot, ROW_MORE])
-            drag = rows[slot, ROW_AREA] * law.tangential_stiffness
-            ux = drag * (rows[slot, ROW_STRETCH] + rows[slot, ROW_MORE + 1])
-            uy = drag * (rows[slot, ROW_STRETCH + 1] + rows[slot, ROW_MORE + 2])
-            uz = drag * (rows[slot, ROW_STRETCH + 2] + rows[slot, ROW_MORE + 3])
+            stretch = plus(part_of_row(rows, slot, ROW_STRETCH), part_of_row(rows, slot, ROW_MORE + 1))
+            drag = times(rows[slot, ROW_AREA] * law.tangential_stiffness, stretch)
             for corner in range(3):
                 node = places[slot, 2 + corner]
                 weight = QUADRATURE_BARYCENTRIC[places[slot, 1] % QUADRATURE_COUNT, corner]
-                fx, fy, fz = corner_force(rows, slot, corner, push, weight, ux, uy, uz)
-                x = work.position[node, 0] - reference[tool, 0]
-                y = work.position[node, 1] - reference[tool, 1]
-                z = work.position[node, 2] - reference[tool, 2]
-                sums[0, thread] -= fx
-                sums[1, thread] -= fy
-                sums[2, thread] -= fz
-                sums[3, thread] -= y * fz - z * fy
-                sums[4, thread] -= z * fx - x * fz
-                sums[5, thread] -= x * fy - y * fx
+                force = corner_force(rows, slot, corner, push, weight, drag)
+                arm = minus(row_of(work.position, node), row_of(reference, tool))
+                take_from_row(sums.T, thread, 0, force)
+                take_from_row(sums.T, thread, 3, vector_product(arm, force))
         _add_up(sums)
         if thread == 0:
             for part in range(6):
@@ -556,9 +544,7 @@ def _hold_squeezed(model, lane, work, dt, block, scratch):
 
 
 def _is_squeezed(model, work, tet):
-    a, b, c, d = model.tet_nodes[tet, 0], model.tet_nodes[tet, 1], model.tet_nodes[tet, 2], model.tet_nodes[tet, 3]
-    _, six = tet_shape(edge(work.position, a, b), edge(work.position, a, c), edge(work.position, a, d))
-    return volume_ratio(six, model.tet_inverse_volume[tet]) < SQUEEZED_RATIO
+    return volume_ratio(_six_volumes(model, work, tet), model.tet_inverse_volume[tet]) < SQUEEZED_RATIO
 
 
 def _touch(model, lane, work, state, shapes, response, law, numbers, reference, wrench, block, scratch, sums):

@@ -241,14 +241,22 @@ class Instrument(ToolBodies):
         """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.
 
         Raises:
-            ValueError: a target outside that range.
+            ValueError: no jaw, or a target outside that range.
         """
-        assert self.jaw is not None
+        if self.jaw is None:
+            raise ValueError(f"{self._where()} has no jaw to command")
         self.jaw.command(target)
 
     def turning_of(self, turning: FloatArray | None) -> FloatArray:
-        """Angular velocity command of the tip [rad/s], (turning_size,); zeros for None."""
-        return np.zeros(self.turning_size) if turning is None else np.asarray(turning, dtype=np.float64)
+        """Angular velocity command of the tip [rad/s], (turning_size,); zeros for None.
+
+        Raises:
+            ValueError: a wrong number of values.
+        """
+        values = np.zeros(self.turning_size) if turning is None else np.asarray(turning, dtype=np.float64)
+        if values.shape != (self.turning_size,):
+            raise ValueError(f"turning has shape {values.shape}; {self._where()} takes ({self.turning_size},)")
+        return values
 
     def refresh(self) -> None:
         """Bring poses and velocities up to the current coordinates (after mj_step2 they are one step old)."""
@@ -287,3 +295,7 @@ class Instrument(ToolBodies):
 
     def _set_jaw(self, jaw: Jaw) -> None:
         self.jaw, self.jaws = jaw, jaw.tools[None]
+
+    def _where(self) -> str:
+        """Name of the instrument in error messages."""
+        return f"instrument {self.model.names.split(bytes(1))[0].decode()!r}"

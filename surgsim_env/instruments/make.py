@@ -12,7 +12,7 @@ from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
 from surgsim_env.instruments.tool_bodies import add_supports, make_servo
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import pair_names, scenes_folder
-from surgsim_env.scene.model import Scene
+from surgsim_env.scene.model import CARTESIAN, Scene
 
 SLIDES = ("x", "y", "z")
 FINGERS = ("finger_upper", "finger_lower")
@@ -37,6 +37,7 @@ class Probe(Instrument):
 
     def command_velocity(self, velocity: FloatArray, turning: FloatArray | None = None) -> None:
         """Command the tip's velocity [m/s] (3,); a probe does not turn."""
+        self.turning_of(turning)
         self.servo.command[:] = velocity
 
 
@@ -134,7 +135,16 @@ class Grasper(Instrument):
 
 
 def read_model(name: str) -> mujoco.MjSpec:
-    """Read the model of a Cartesian instrument from its file in scenes/instruments."""
+    """Read the model of a Cartesian instrument, one of CARTESIAN in scenes/instruments.
+
+    Raises:
+        ValueError: another name (lists the known ones).
+    """
+    known = sorted(f"{name}.xml" for name in CARTESIAN)
+    if name not in known:
+        raise ValueError(
+            f"instrument {name!r} is unknown; the instruments are {', '.join(known)}, and arms by name or TOML file"
+        )
     return mujoco.MjSpec.from_file(str(scenes_folder() / "instruments" / name))
 
 

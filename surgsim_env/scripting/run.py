@@ -209,6 +209,8 @@ def _of_arm(view: View, simulation: Simulation, pair: Pair, side: str) -> View:
 
 def _inner(env: gym.Env) -> SurgicalEnv:
     """Unwrapped environment, checked for the channels of scripts."""
+    if isinstance(env, gym.vector.VectorEnv):
+        raise TypeError("a script runs in one environment, not in a vector environment: make one with gym.make")
     inner = env.unwrapped
     if not isinstance(inner, SurgicalEnv):
         raise TypeError(f'{type(inner).__name__} is no environment of this project: use gym.make("SurgSim/Palpate-v0")')

@@ -114,9 +114,14 @@ class TaskLayout:
         """Lower and upper bounds of the observation with an instrument, shape (n_observation,) each; all finite.
 
         Raises:
-            ValueError: a channel whose bounds are not finite or do not fit its size.
+            ValueError: a channel whose bounds are not finite, do not fit its size, or are the wrong way round.
         """
-        return self._declared("low", instrument), self._declared("high", instrument)
+        low, high = self._declared("low", instrument), self._declared("high", instrument)
+        for index in np.flatnonzero(low > high).tolist():
+            raise ValueError(
+                f"channel {self.entry_name(index)}: low is {low[index]:g}, above high {high[index]:g}: swap them"
+            )
+        return low, high
 
     def scales(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
         """Origin and scale of each entry of the observation with an instrument, shape (n_observation,) each.
@@ -124,9 +129,12 @@ class TaskLayout:
         An environment observes (value - origin) / scale.
 
         Raises:
-            ValueError: a channel whose origin or scale is not finite or does not fit its size.
+            ValueError: a channel whose origin or scale is not finite, does not fit its size, or a scale not above 0.
         """
-        return self._declared("origin", instrument), self._declared("scale", instrument)
+        scale = self._declared("scale", instrument)
+        for index in np.flatnonzero(scale <= 0.0).tolist():
+            raise ValueError(f"channel {self.entry_name(index)}: scale is {scale[index]:g}; it must be above 0")
+        return self._declared("origin", instrument), scale
 
     def _declared(self, field: str, instrument: Instrument | None) -> FloatArray:
         """A bound, the origin or the scale of each entry of the observation, (n_observation,)."""

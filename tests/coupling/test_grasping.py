@@ -109,6 +109,8 @@ def test_turning_the_wrist_leaves_the_tip_where_it_is():
     run(one, 80, turning=np.array([1.0]))
     assert one.instrument.workspace_limited
     assert one.instrument.pitch == pytest.approx(1.9, abs=2e-3)
+    with pytest.raises(ValueError, match=r"turning has shape \(3,\); instrument 'grasper' takes \(1,\)"):
+        one.instrument.command_velocity(np.zeros(3), np.zeros(3))
 
 
 def test_an_arm_turns_the_jaw_with_its_whole_frame():

@@ -223,9 +223,16 @@ def test_two_channels_of_one_name_are_refused():
 # ---- refusals at construction and at the first reset -----------------------------------------------------------------
 
 
-def test_bounds_that_are_not_finite_are_refused_at_construction():
-    with pytest.raises(ValueError, match=r"'one'.*nan"):
-        environment_class(type("Wrong", (Touch,), {"channels": (CONTACT_FORCE, channel(low=lambda *_: np.nan))}))()
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"low": lambda *_: np.nan}, "'one'.*nan"),
+        ({"low": lambda *_: 3.0}, r"one\[0\].*low is 3"),
+    ],
+)
+def test_wrong_bounds_are_refused_at_construction(changes, named):
+    with pytest.raises(ValueError, match=named):
+        environment_class(type("Wrong", (Touch,), {"channels": (CONTACT_FORCE, channel(**changes))}))()
 
 
 @pytest.mark.parametrize(

@@ -243,3 +243,5 @@ def test_the_jaw_goes_to_its_target_and_stays_there():
     assert angles == pytest.approx([reached, reached], abs=1e-3)
     with pytest.raises(ValueError, match=r"jaw target 2 is out of range: it goes from -1 \(closed\) to 1 \(open\)"):
         grasper.command_jaw(2.0)
+    with pytest.raises(ValueError, match="has no jaw to command"):
+        made("psm_palpator").command_jaw(0.1)

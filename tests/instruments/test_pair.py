@@ -63,6 +63,8 @@ def test_each_tip_follows_its_own_line():
     sim.instrument.arms["left"].command_jaw(-1.0)
     run(sim, 12)
     assert sim.instrument.jaw.opening == pytest.approx(0.0055, abs=2e-4)
+    with pytest.raises(ValueError, match=r"psm_palpator.* has no jaw: it carries a palpator"):
+        sim.instrument.arms["right"].command_jaw(0.0)
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.1])

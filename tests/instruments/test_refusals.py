@@ -1,10 +1,13 @@
 """A mistake in an arm of one's own is named."""
 
+import os
+
 import numpy as np
 import pytest
 
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.instruments.arm.model import FILE_SIZE_MOST
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import list_arms, make_scene, scenes_folder
 from surgsim_env.scene.model import Port
@@ -191,3 +194,9 @@ def test_missing_meshes_are_named(tmp_path):
     urdf = swap(URDF, "VISUAL", '<mesh filename="package://stick/meshes/swing.stl"/>')
     path = written(tmp_path, URDF_TABLE, urdf, model_name="stick.urdf")
     assert_refused(path, r"swing\.stl")
+
+
+def test_a_model_file_that_is_too_large_is_refused_unread(tmp_path):
+    path = written(tmp_path, *texts())
+    os.truncate(tmp_path / "psm_palpator.xml", FILE_SIZE_MOST + 1)
+    assert_refused(path, "200000001")

@@ -114,6 +114,9 @@ class ArmInstrument(SteeredArms):
         """
         self.steered.command_velocity(velocity, self.turning_of(turning))
 
+    def _where(self) -> str:
+        return self.steered.where
+
     def _check_reach(self, anatomy: Anatomy) -> None:
         """Check that the tip reaches places all over the palpable face."""
         face, retract = anatomy.face, anatomy.scene.retract
@@ -127,7 +130,7 @@ class ArmInstrument(SteeredArms):
             solution = self.steered.reach(place)
             if not placed(solution):
                 raise ValueError(
-                    f"{self.steered.where} does not reach the palpable face of scene {anatomy.scene.name!r} at "
+                    f"{self._where()} does not reach the palpable face of scene {anatomy.scene.name!r} at "
                     f"{millimetres(place)}: {missing(solution)}; move its [port]"
                 )
 

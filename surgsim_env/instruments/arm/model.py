@@ -22,6 +22,8 @@ from surgsim_env.scene.model import Port, frame_into
 # Groups of geoms: visual only, and outer links for clearances; geoms of CONTACT_GROUP touch tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
+# Largest size of a model file [bytes]: chosen, MuJoCo would read a larger one for minutes.
+FILE_SIZE_MOST = 200_000_000
 # Colour of a description's added shapes.
 SHAPE_COLOUR = (0.72, 0.74, 0.78, 1.0)
 
@@ -105,9 +107,12 @@ def read_xml(path: Path) -> ElementTree.Element:
     """Read the root element of a model file.
 
     Raises:
-        ValueError: an unreadable file, or one without valid XML.
+        ValueError: an unreadable file, one larger than FILE_SIZE_MOST, or one without valid XML.
     """
     try:
+        size = path.stat().st_size
+        if size > FILE_SIZE_MOST:
+            raise ValueError(f"model file {path} has {size} bytes; at most {FILE_SIZE_MOST} are read: reduce it")
         return ElementTree.fromstring(path.read_bytes())
     except OSError as error:
         raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None

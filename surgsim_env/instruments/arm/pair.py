@@ -150,6 +150,9 @@ class Pair(SteeredArms):
                 total += sign * matmul(contact.frame.reshape(3, 3).T, force[:3])
         return float(norm(total))
 
+    def _where(self) -> str:
+        return f"the pair of {self.arms['left'].where} and {self.arms['right'].where}"
+
 
 def _compile(arms: dict[str, Arm], scene: Scene) -> mujoco.MjModel:
     """Compile both arms and the supports into one model; the names of an arm's parts have its side as a prefix."""

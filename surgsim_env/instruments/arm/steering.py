@@ -170,9 +170,10 @@ class SteeredArm:
         """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.
 
         Raises:
-            ValueError: a target outside that range.
+            ValueError: no jaw, or a target outside that range.
         """
-        assert self.jaw is not None
+        if self.jaw is None:
+            raise ValueError(f"{self.where} has no jaw: it carries a {self.arm.description.kind}")
         self.jaw.command(target)
 
     def get_state(self) -> FloatArray:

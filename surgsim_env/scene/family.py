@@ -171,6 +171,11 @@ class OrganFamily:
         Raises:
             ValueError: a number beyond the split.
         """
+        if not 0 <= number < self.size:
+            raise ValueError(
+                f"scene {self.template.scene.name!r} has no member {number} in split {self.split!r}; they are numbered "
+                f"from 0 to {self.size - 1}"
+            )
         return _cached_member(self.template, MemberName(self.split, number))
 
     def draw(self, rng: np.random.Generator) -> Anatomy:

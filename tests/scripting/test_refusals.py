@@ -80,7 +80,7 @@ def test_a_wrapper_that_changes_actions(env):
 def test_other_environments_and_several_at_once():
     with pytest.raises(TypeError, match="CartPoleEnv"):
         run_script(gym.make("CartPole-v1"), [Hold(0.1)])
-    with pytest.raises(TypeError, match="vector"):
+    with pytest.raises(TypeError, match="VectorEnv"):
         run_script(gym.make_vec("CartPole-v1", num_envs=2), [Hold(0.1)])
     with pytest.raises(TypeError, match="PalpateSitesTask"):
         run_script(gym.make("SurgSim/PalpateSites-v0", scene="phantom_small"), [Hold(0.1)])

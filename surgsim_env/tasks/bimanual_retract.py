@@ -198,7 +198,7 @@ class BimanualRetractTask(RetractTask):
         return np.stack([left, right])
 
     def look(self, simulation: Simulation) -> None:
-        """As `RetractTask.look`; also what the organ leaves uncovered and what the right tip presses."""
+        """Read the grasp, the visible and the uncovered share of the target, and the force on the supports."""
         super().look(simulation)
         self._feel(simulation)
 
@@ -217,7 +217,7 @@ class BimanualRetractTask(RetractTask):
         return "collided" if _pair(step.simulation).collision_force > COLLISION_FORCE else ""
 
     def at_goal(self, simulation: Simulation) -> bool:
-        """The jaw holds tissue, the target is exposed and the right tip touches it."""
+        """True if the jaw holds tissue, the target is exposed and the right tip touches it."""
         assert self.grasp is not None
         return self.grasp.holds and self.uncovered_share >= SUCCESS_SHARE and self.touches(simulation)
 
@@ -233,14 +233,14 @@ class BimanualRetractTask(RetractTask):
         return max(1.0 - float(away) / NEAR, 0.0)
 
     def _from_target(self, simulation: Simulation) -> FloatArray:
-        """From the target's centre to the right tip's lowest point [m], (3,)."""
+        """Vector from the target's centre to the right tip's lowest point [m], (3,)."""
         target = self.target
         assert target is not None
         lowest = _right(simulation).tip_position - target.normal * self.anatomy.scene.instrument.tip_radius
         return lowest - target.moved(simulation.ground_shift(target.centre)).centre
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
-        """As `RetractTask.info`, and what the right arm does; nothing of it after a reset or a fault."""
+        """Entries of `RetractTask.info` and of the right arm; no touch and no collision after a reset or a fault."""
         simulation = step.simulation if step is not None and not step.fault else None
         return {
             **super().info(step, end),
@@ -253,7 +253,7 @@ class BimanualRetractTask(RetractTask):
 
 
 def _check_tips(pair: "Pair") -> None:
-    """The left arm can hold tissue, the right one can touch."""
+    """Refuse a left arm without flat pads and a right arm without a ball."""
     left, right = pair.arms["left"], pair.arms["right"]
     if left.jaw is None or not left.jaw.has_pads:
         raise ValueError(

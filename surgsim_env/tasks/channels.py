@@ -1,10 +1,10 @@
-"""Observation channels and reward values that many tasks share."""
+"""Observation channels and reward values shared by tasks."""
 
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, Channel, ControlStep
 from surgsim_env.tasks.task import Task
 
-# Length that is observed as 1 [m], near the radius of a tip.
+# Scale of observed lengths [m], near the radius of a tip.
 LENGTH_SCALE = 0.01
 # Bounds of the tip beyond its workspace [m] and on its speed [m/s].
 POSITION_SLACK = 0.005
@@ -12,7 +12,7 @@ SPEED_BOUND = 0.5
 
 
 def force_scale(task: Task, instrument: Instrument | None) -> float:
-    """Force that is observed as 1 [N]: the scene's soft limit."""
+    """Scale of observed forces [N]: the scene's soft limit."""
     return task.limits.soft_force
 
 

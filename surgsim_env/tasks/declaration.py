@@ -22,7 +22,7 @@ Size = int | Callable[[Any], int]
 Bound = float | Sequence[float] | Callable[[Any, Any], ArrayLike]
 Period = Literal["step", "change", "success", "failure", "step left"]
 
-# How the documentation explains a reward's period.
+# Periods of rewards in words, for the documentation.
 PERIODS: dict[str, str] = {
     "step": "control step",
     "change": "change of the value",
@@ -45,10 +45,10 @@ class Command:
         size: number of entries, or a function `(task)`; 0 leaves the command out
         scale: SI value of an entry of 1; entries lie in [-1, 1]
         unit: SI unit, "" for none
-        meaning: what it does, for the table of actions
-        size_text: what the table shows for a size that is a function
-        axes: function `(task)` that returns the axes of a vector, unit vectors as rows (3, 3); None for the world's
-        default: function `(task)` that returns the SI value where `TaskLayout.action` is given none; None for 0
+        meaning: for the table of actions
+        size_text: text of the table for a size given by a function
+        axes: function `(task)`, the axes of a vector as unit rows (3, 3); None for the world's
+        default: function `(task)`, the SI value for `TaskLayout.action` without one; None for 0
     """
 
     name: str
@@ -69,17 +69,17 @@ class Channel:
         name: an identifier; `observation_slices` has it as a key
         size: number of entries, or a function `(task)`; 0 leaves the channel out
         unit: SI unit, "" for none
-        low, high: bounds: a number, one for each entry, or a function `(task, instrument)` that returns them; a value
-            outside is a fault. Left out where there is a `sensor`: plus and minus its range
-        read: function `(task, simulation)` that returns the value, `size` numbers
-        meaning: what it is, for the table of observations
+        low, high: bounds: a number, a number for each entry, or a function `(task, instrument)` of these; a value
+            outside is a fault. With a `sensor` left out: plus and minus its range
+        read: function `(task, simulation)`, the value as `size` numbers
+        meaning: for the table of observations
         sensor: 0, or the factor on noise, bias and range of the scene's force sensor, whose model the value (3 numbers)
             passes through
-        felt: whether it depends on force sensing, so that `observe_force=False` observes it as 0; true with a `sensor`
-        size_text, bounds_text, scale_text: what the table shows for a size, bounds and a scale that are functions
-        scale: value that an environment observes as 1, as a bound is given; required of a channel with a unit
-        origin: value that it observes as 0, likewise
-        late_bias: whether the sensor's bias is drawn after the task's `draw`, not before
+        felt: True if it depends on force sensing and `observe_force=False` observes it as 0; so with a `sensor`
+        size_text, bounds_text, scale_text: texts of the table for size, bounds and scale given by functions
+        scale: value observed as 1, in the form of a bound; required with a unit
+        origin: value observed as 0, likewise
+        late_bias: True if the sensor's bias is drawn after the task's `draw`, not before
     """
 
     name: str
@@ -122,14 +122,14 @@ class Channel:
 
     @property
     def scale_shown(self) -> str:
-        """Its scale as the table of observations shows it."""
+        """Scale for the table of observations."""
         if isinstance(self.scale, int | float):
             return f"{self.scale:g} {self.unit}".strip()
         return self.scale_text
 
     @property
     def bounds_shown(self) -> str:
-        """Its bounds as the table of observations shows them."""
+        """Bounds for the table of observations."""
         if isinstance(self.low, int | float) and isinstance(self.high, int | float):
             return f"+-{self.high:g}" if self.low == -self.high else f"{self.low:g} to {self.high:g}"
         return self.bounds_text
@@ -137,7 +137,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class ControlStep:
-    """A control step as the simulation left it; a reset counts as one without force.
+    """State of the simulation after a control step; a reset counts as a step without force.
 
     Fields:
         simulation: between two control steps
@@ -155,13 +155,13 @@ class Reward:
     """A named reward term; it pays `weight` times an amount.
 
     Fields:
-        name: an identifier; `info["reward_<name>"]` shows what was paid
+        name: an identifier; `info["reward_<name>"]` is the paid amount
         weight: of the term
-        per: what the amount is. "step": `value` in each control step (1 without one); "change": the change of `value`
+        per: kind of the amount. "step": `value` in each control step (1 without one); "change": the change of `value`
             since the control step before, so that it cannot be earned twice; "success" and "failure": 1 in the control
             step in which the episode ends with this name (see `Task.end`); "step left": the control steps left when
             the episode ends in failure, or `value` then
-        meaning: what it is for, for the table of rewards
+        meaning: for the table of rewards
         value: function `(task, control_step)`, best in [0, 1]
     """
 
@@ -181,11 +181,11 @@ class Setup:
     """Scene, instrument, lesions and length of a task's episodes.
 
     Fields:
-        scene, instrument, level: where the environment's arguments say none; instrument None: the scene's; level None:
+        scene, instrument, level: defaults of the environment's arguments; instrument None: the scene's; level None:
             the scene's own ranges
         lesion_count: number of lesions, or its least and most; None: as drawn by the level, without a level none
         episode_steps: control steps until an episode is truncated; None where the task ends it by itself
-        load: function that makes the scene of a name or file
+        load: function from the name or file of a scene to the scene
         drawn: class of an episode's organ, with `draw`, `to_json`, `from_json` and `compiled` as `DrawnOrgan` has
     """
 
@@ -242,7 +242,7 @@ def observation_table(task_class: Any) -> str:
 
 
 def reward_table(task_class: Any) -> str:
-    """Reward terms of a task: weight, what it is paid for, meaning."""
+    """Reward terms of a task: weight, period, meaning."""
     rows = [(f"`{term.name}`", f"{term.weight:g}", PERIODS[term.per], term.meaning) for term in task_class.rewards]
     return table("term, weight, paid per, meaning", rows)
 
@@ -250,7 +250,7 @@ def reward_table(task_class: Any) -> str:
 def documentation(task_class: Any) -> str:
     """The documentation of an environment in Gymnasium's form: the task's docstring with the declared tables.
 
-    Sections that the docstring lacks are left out, but for those that the declaration fills.
+    Sections missing in the docstring are left out, except those filled from the declaration.
     """
     summary, sections = docstring_sections(inspect.getdoc(task_class) or "")
     filled = {

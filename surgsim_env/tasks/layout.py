@@ -40,7 +40,7 @@ class TaskLayout:
 
     @property
     def speed_limit(self) -> float:
-        """The largest tip velocity that an action can command along an axis [m/s]."""
+        """Largest tip velocity of an action along an axis [m/s]."""
         return self._commands["velocity"].scale
 
     def action(self, velocity: FloatArray | None = None, **commands: Any) -> FloatArray:
@@ -49,7 +49,7 @@ class TaskLayout:
         Those left out, or None, have their default, else 0.
 
         Raises:
-            TypeError: a command that the task does not have (lists those that it has).
+            TypeError: an unknown command (lists the task's commands).
         """
         given = {"velocity": velocity, **commands}
         for name, value in given.items():
@@ -82,12 +82,12 @@ class TaskLayout:
 
     @property
     def force_entries(self) -> list[int]:
-        """Indices of the observation that depend on force sensing: those of the channels marked `felt`."""
+        """Indices of the observation's entries from force sensing: those of the channels marked `felt`."""
         felt = [channel.felt for channel, size in self.observed for _ in range(size)]
         return np.flatnonzero(felt).tolist()
 
     def entry_name(self, index: int) -> str:
-        """The channel of an entry of the observation, with the place in it: "contact_force[2]"."""
+        """Name of an entry of the observation, by channel and index: "contact_force[2]"."""
         names = [f"{channel.name}[{place}]" for channel, size in self.observed for place in range(size)]
         return names[index]
 
@@ -152,7 +152,7 @@ class TaskLayout:
 
 
 def channel_slices(task_class: type[Task], **sizes: int) -> dict[str, slice]:
-    """Slices of a task's observation without an episode, from the sizes of the channels whose size is a function."""
+    """Slices of a task's observation without an episode; `sizes` are those of channels with a function for a size."""
     return _slices((channel.name, sizes.get(channel.name, channel.size)) for channel in task_class.channels)
 
 

@@ -29,7 +29,7 @@ from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
 # Control steps of an episode; EPISODE_STEPS_WIDE where the chart's longer side exceeds WIDE tip radii.
 EPISODE_STEPS, EPISODE_STEPS_WIDE = 600, 1200
-# Axes of commands, and what they are relative to.
+# Axes of commands.
 FRAMES = ("world", "face")
 # Bound of the depth and of the place of the tip over its radius, beyond any workspace.
 PLACE_BOUND = 1000.0
@@ -65,7 +65,7 @@ def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
 
 
 def _in_frame(size: int, *, memory: bool = False) -> Callable[["PalpateTask"], int]:
-    """Size of a channel that there is with frame="face", and where it says so only with memory=True."""
+    """Size of a channel of frame="face"; with `memory` of memory=True alone."""
     return lambda task: size if task.frame is not None and (task.memory is not None or not memory) else 0
 
 
@@ -263,8 +263,8 @@ class PalpateTask(Task):
 
         Args:
             scenario: of a scene with the ranges of a lesion.
-            memory: the observation holds what was felt so far.
-            frame: "world", or "face": commands are along the axes of the face, in which the tip is observed too.
+            memory: the observation holds the readings so far.
+            frame: "world", or "face": commands and observations of the tip along the axes of the face.
             episode_steps: control steps of an episode; by default 600, or 1200 on a face longer than ten tip radii.
 
         Raises:
@@ -331,12 +331,12 @@ class PalpateTask(Task):
         self._declare_value = float(commands["declare"][0])
 
     def resting_place(self, simulation: Simulation) -> FloatArray:
-        """The tip's position [m] (3,) beside the organ at rest: less the way that its ground has moved there."""
+        """Tip position relative to the organ at rest [m], (3,): less the displacement of the ground there."""
         tip = simulation.instrument.tip_position
         return tip - simulation.ground_shift(tip)
 
     def update(self, step: ControlStep) -> None:
-        """Find the ball's depth below the surface at rest on its ground, and add the force reading to the memory."""
+        """Measure the ball's depth below the surface at rest, and add the force reading to the memory."""
         memory, frame = self.memory, self.frame
         if memory is None and frame is None:
             return
@@ -348,7 +348,7 @@ class PalpateTask(Task):
             memory.feel(memory.chart.place(surface), depth, float(matmul(self.sensed["contact_force"], normal)))
 
     def end(self, step: ControlStep) -> str:
-        """A fault, the hard limit, or a declaration: "found" or "wrong"."""
+        """Reason of the end: a fault, the hard limit, or a declaration, "found" or "wrong"."""
         end = super().end(step)
         declared = not end and self._declares(step.simulation)
         self._error = self.declared_error(step.simulation) if declared else None
@@ -357,7 +357,7 @@ class PalpateTask(Task):
         return "found" if self._error <= self.success_distance else "wrong"
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
-        """As `Task.info`, and what was declared."""
+        """Entries of `Task.info` and of the declaration, with its error."""
         declared = end in ("found", "wrong")
         assert not declared or self._error is not None
         return {

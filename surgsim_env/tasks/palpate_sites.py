@@ -1,4 +1,4 @@
-"""Palpation press by press: choose sites to press on; an estimator locates the lesions from what was felt."""
+"""Palpation by single presses at chosen sites; an estimator locates the lesions from the readings."""
 
 import math
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def _force_bound(task: "PalpateSitesTask") -> float:
 
 
 class PalpateSitesTask(Task):
-    """Find hidden lesions by choosing where to press, one press a step.
+    """Find hidden lesions by single presses at chosen sites.
 
     ## Description
     Up to three stiff lesions, or none, lie hidden under the surface of a soft organ. The agent names sites on its
@@ -233,7 +233,7 @@ class PalpateSitesTask(Task):
             scenario: with a level.
             memory: observe all presses; else the last one alone.
             budget: presses of an episode; by default 25, or 60 where the chart's longer side is above ten tip radii.
-            track_motion: presses go with a surface that moves.
+            track_motion: presses follow a moving surface.
 
         Raises:
             ValueError: a budget that is no whole number above 0.
@@ -288,14 +288,14 @@ class PalpateSitesTask(Task):
         return middle.point + middle.normal * gap
 
     def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
-        """Nothing: a press commands the instrument itself."""
+        """No command: the press moves the instrument."""
 
     def site(self, action: FloatArray) -> Site:
-        """The site that an action (2,) asks to press, or the nearest that may be pressed."""
+        """Site of an action (2,), or the nearest pressable site."""
         return self.charted.site(np.clip(action, -1.0, 1.0))
 
     def take(self, site: Site, result: PressResult, rng: np.random.Generator) -> bool:
-        """Take the result of a press at a site through the sensor; returns whether that saturated."""
+        """Add the result of a press at a site, read through the sensor; True if the sensor saturated."""
         # Between presses the sensor bears nothing.
         self.reading.follow(np.zeros(3))
         reading, saturated = self.reading.read(result.force, rng, self.felt.seconds)
@@ -311,7 +311,7 @@ class PalpateSitesTask(Task):
         self.found = self._found_share()
 
     def _found_share(self) -> float:
-        """Share of lesions with an estimate near them; without lesions 1 where there is no estimate either."""
+        """Share of lesions with an estimate near them; without lesions 1 for no estimate, else 0."""
         if len(self.truth) == 0:
             return float(len(self.estimated) == 0)
         distance = np.sqrt(np.square(self.truth[:, None] - self.estimated).sum(axis=2))
@@ -320,7 +320,7 @@ class PalpateSitesTask(Task):
     # ---- judgement --------------------------------------------------------------------------------------------------
 
     def end(self, step: ControlStep) -> str:
-        """A fault, the hard limit, or the end of the budget: "success" or "done"."""
+        """Reason of the end: a fault, the hard limit, or a spent budget, "success" or "done"."""
         if harm := super().end(step):
             return harm
         if self.step_count < self.budget:
@@ -328,7 +328,7 @@ class PalpateSitesTask(Task):
         return "success" if self.error <= SUCCESS_ERROR * self.tip_scale else "done"
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
-        """As `Task.info`, with the last press and the estimate so far."""
+        """Entries of `Task.info`, of the last press and of the estimate so far."""
         last: Touch = self.felt.last
         return {
             **super().info(step, end),

@@ -1,4 +1,4 @@
-"""Retraction: grasp a lobe near its free edge and fold it back, so that the endoscope sees what lies under it."""
+"""Retraction of a lobe, grasped near its free edge, from a target in the endoscope's view."""
 
 import json
 import math
@@ -33,10 +33,10 @@ from surgsim_env.tasks.visibility import Disc, hiding_geoms, visible
 EPISODE_STEPS = 600
 # Full scale of a command to turn the wrist [rad/s].
 TURNING_FULL_SCALE = 0.5
-# Success: this share of the target is visible for this time [s].
+# Visible share of the target and its duration [s] for success.
 SUCCESS_SHARE = 0.8
 SUCCESS_TIME = 0.5
-# Largest share of it that is visible when an episode begins.
+# Largest visible share of the target at the start of an episode.
 HIDDEN_SHARE = 0.1
 
 # The torque sensor is the force sensor times this lever [m].
@@ -46,7 +46,7 @@ LOBE_SLACK = 0.1
 AXIS_BOUND = 1.0 + 1e-6
 OPENING_BOUND = 0.1
 FORCE_BOUND = 200.0
-# Points of the lobe whose nodes are observed, as shares of its length along the edge, its depth and its thickness: a
+# Observed points of the lobe, as shares of its length along the edge, its depth and its thickness: a
 # row on the free edge, and one half way to the held edge.
 ALONG = (0.0, 0.25, 0.5, 0.75, 1.0)
 TRACKED = tuple((along, depth, 1.0) for depth in (1.0, 0.5) for along in ALONG)
@@ -72,9 +72,9 @@ class RetractionDraw:
         scale: factor on the whole lobe.
         youngs_modulus: of its tissue [Pa].
         capsule_stiffness: modulus times thickness of its capsule [N/m], 0 without one.
-        held_share: which share of the anchored edge is held.
+        held_share: held share of the anchored edge.
         target: centre of the disc on the bed [m].
-        eye, looks_at: where the endoscope stands and looks [m].
+        eye, looks_at: position of the endoscope and a point in the middle of its view [m].
         start: the tip's place [m].
     """
 
@@ -109,11 +109,11 @@ class RetractionDraw:
 
     @classmethod
     def from_json(cls, text: str, anatomy: Anatomy) -> Self:
-        """The draw that `to_json` wrote."""
+        """The draw of a text from `to_json`."""
         return fill(cls, json.loads(text), "drawn")
 
     def compiled(self, anatomy: Anatomy) -> OrganModel:
-        """The scene's lobe as the episode has it."""
+        """The lobe of the episode, compiled."""
         plain = anatomy.specification()
         mesh = anatomy.mesh
         capsule = plain.capsule
@@ -130,7 +130,7 @@ class RetractionDraw:
 
 
 class RetractTask(Task):
-    """Grasp a lobe and fold it back until the endoscope sees what it hides.
+    """Grasp a lobe and fold it back until the endoscope sees the target under it.
 
     ## Description
     A lobe of soft tissue, held along one edge, lies on its bed and hides a disc. A robot's jaw grasps it near its free
@@ -276,7 +276,7 @@ class RetractTask(Task):
         scene="lobe", episode_steps=EPISODE_STEPS, load=make_retract_scene, drawn=RetractionDraw
     )
     kept = ("goal_count", "jaw_target", "visible_share", "measured")
-    # Whether two arms do it.
+    # True for a task of two arms.
     takes_pair: ClassVar[bool] = False
     drawn: RetractionDraw | None
 
@@ -362,7 +362,7 @@ class RetractTask(Task):
         self.visible_share = self._look(simulation)
 
     def update(self, step: ControlStep) -> None:
-        """Look, and add a control step to the record."""
+        """Read the grasp and the target's visible share, and add a control step to the record."""
         simulation = step.simulation
         self.look(simulation)
         if self.step_count == 0:
@@ -375,14 +375,14 @@ class RetractTask(Task):
         self.record.note(self.grasp, simulation.pull_peak, tip, strain, self.jaw_target < 0.0, duration)
 
     def end(self, step: ControlStep) -> str:
-        """Harm, or success where the goal has lasted for SUCCESS_TIME."""
+        """Reason of the end: a failure, or success after SUCCESS_TIME at the goal."""
         harm = self.harm(step)
         self.goal_count = self.goal_count + 1 if not harm and self.at_goal(step.simulation) else 0
         lasted = self.goal_count >= round(SUCCESS_TIME / self.anatomy.scene.timing.control_step)
         return harm or ("success" if lasted else "")
 
     def harm(self, step: ControlStep) -> str:
-        """Name of the failure that a control step caused; "" for none."""
+        """Name of the failure in a control step; "" for none."""
         if step.fault:
             return "fault"
         if step.simulation.pull_peak > self.limits.tear_force:
@@ -410,7 +410,7 @@ class RetractTask(Task):
         }
 
     def _look(self, simulation: Simulation, *, past_instruments: bool = True) -> float:
-        """Share of the target that the endoscope sees; hidden by the organ alone where instruments do not count."""
+        """Visible share of the target from the endoscope, past the organ and, with `past_instruments`, instruments."""
         instrument, drawn, target = simulation.instrument, self.drawn, self.target
         assert drawn is not None and target is not None
         target = target.moved(simulation.ground_shift(target.centre))
@@ -453,7 +453,7 @@ def tip_axes(instrument: Instrument) -> FloatArray:
 
 
 def _checked_scene(anatomy: Anatomy) -> tuple[Retraction, Endoscope]:
-    """The tables of a scene that a retraction needs."""
+    """The [retract] and [endoscope] tables of a scene."""
     scene = anatomy.scene
     for name, table in (("retract", scene.retract), ("endoscope", scene.endoscope)):
         if table is None:
@@ -466,29 +466,29 @@ def _checked_scene(anatomy: Anatomy) -> tuple[Retraction, Endoscope]:
 
 
 def _nearest_nodes(points: FloatArray, box: tuple[FloatArray, FloatArray]) -> NDArray[np.int64]:
-    """The nodes nearest to the TRACKED places of what is lifted, (n_tracked,)."""
+    """Nodes nearest to the TRACKED places in the lifted box, (n_tracked,)."""
     low, high = box
     places = low + np.array(TRACKED) * (high - low)
     return np.array([int(np.argmin(np.square(points - place).sum(axis=1))) for place in places])
 
 
-# ---- what an episode draws -------------------------------------------------------------------------------------
+# ---- draw of an episode ----------------------------------------------------------------------------------------
 
-# A drawn capsule is this thick [m]; what counts is its modulus times this.
+# Thickness of a drawn capsule [m]; only its product with the modulus counts.
 CAPSULE_THICKNESS = 1e-4
-# A target lies this far above its bed [m], so that the bed does not hide it.
+# Height of a target above its bed [m], so that the bed does not hide it.
 TARGET_LIFT = 1e-4
 
 
 def lifted_box(table: Retraction, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners of the box of what is lifted, of an organ whose nodes are at some places [m]: two of shape (3,)."""
+    """Lower and upper corner of the lifted part's box, for nodes at `points` [m], (3,) each."""
     if table.flap is None:
         return points.min(axis=0), points.max(axis=0)
     return np.array(table.flap.lower), np.array(table.flap.upper)
 
 
 def held_nodes(points: FloatArray, anchors: IntArray, share: float) -> IntArray:
-    """Those of the anchored nodes that lie in the middle share of the edge, along x."""
+    """Anchored nodes in the middle share of the edge, along x."""
     along = points[anchors, 0]
     middle, half = 0.5 * (along.min() + along.max()), 0.5 * np.ptp(along)
     # A node that lies on the border by rounding is held.
@@ -496,7 +496,7 @@ def held_nodes(points: FloatArray, anchors: IntArray, share: float) -> IntArray:
 
 
 def _moved(endoscope: Endoscope, camera: RetractionCamera, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """An endoscope moved evenly within a ball, its view turned about an axis across it: where it stands and looks."""
+    """Position and viewed point of an endoscope shifted uniformly within a ball and turned about an axis across it."""
     way = rng.normal(size=3)
     shift = way / norm(way) * camera.shift * cbrt(rng.uniform())
     view = np.subtract(endoscope.target, endoscope.position)
@@ -514,11 +514,11 @@ def _vector(values: FloatArray) -> Vector:
     return x, y, z
 
 
-# ---- what is measured over an episode ---------------------------------------------------------------------------
+# ---- measures of an episode -------------------------------------------------------------------------------------
 
 # The lobe's thirds, from the anchored edge to the free one.
 REGIONS = ("held", "middle", "free")
-# A hold slips where friction has less than this share of what it could bear left.
+# Remaining friction over grip force at and below which a hold slips.
 SLIP_SHARE = 0.02
 
 
@@ -561,7 +561,7 @@ class RetractionRecord:
             pull_peak: largest pull of its haptic steps [N].
             tip: position at its end [m], (3,).
             strain: largest strain of each region at its end.
-            closing: whether the jaw's target is nearer to closed than to open.
+            closing: True if the jaw's target is nearer to closed than to open.
             duration: of the step [s].
         """
         self.steps += 1
@@ -582,7 +582,7 @@ class RetractionRecord:
         self.strain = [max(pair) for pair in zip(self.strain, strain)]
 
     def info(self) -> dict[str, bool | float | str]:
-        """The measures so far, by the names that `info` has."""
+        """Measures so far, by their keys in `info`."""
         held = max(self.held_steps, 1)
         return {
             "grip_force_peak": self.grip_peak,
@@ -597,14 +597,14 @@ class RetractionRecord:
 
 
 def region_strains(model: OrganModel, node_position: FloatArray, box: tuple[FloatArray, FloatArray]) -> list[float]:
-    """Largest strain of an edge in each third of what is lifted, by the middle of the edge at rest along y.
+    """Largest strain of an edge in each third of the lifted part, by the edge's middle at rest along y.
 
     The strain of an edge is its lengthening over its length at rest; shortening counts as 0.
 
     Args:
         model: the organ.
         node_position: of its nodes now [m], (n_node, 3).
-        box: corners of the box of what is lifted [m], (3,) each; other edges do not count.
+        box: corners of the lifted part's box [m], (3,) each; other edges do not count.
     """
     first, second = model.spring_nodes.T
     lengths = norm(node_position[first] - node_position[second], axis=1)

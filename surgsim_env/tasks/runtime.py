@@ -27,7 +27,7 @@ from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
 # Draws of an episode until the task has to accept one.
 DRAWS_MOST = 20
-# Name of the end where tissue bears more than the limits of pressure or strain.
+# Name of the end by tissue above the limits of pressure or strain.
 DAMAGE = "damage"
 
 
@@ -51,7 +51,7 @@ class TaskRuntime:
         task: the task
         layout: of its actions and observations
         family: members that episodes draw from; None for a scene of one organ
-        sensors: sensor model of each channel that has one, by the channel's name
+        sensors: sensor models, by the channel's name
         failures: names of the ends that are failures
     """
 
@@ -64,19 +64,19 @@ class TaskRuntime:
         self.sensors = {channel.name: ForceReading(_scaled(own, channel.sensor)) for channel in self._sensed}
         declared = [reward.name for reward in task.rewards if reward.per == "failure"]
         self.failures = tuple(dict.fromkeys(("fault", *declared, "hard_force", DAMAGE)))
-        # Values of the terms that pay for their change.
+        # Last values of the terms paid per change.
         self._reached: dict[str, float] = {}
 
     # ---- limits of a control step ------------------------------------------------------------------------------
 
     @property
     def force_limit(self) -> float:
-        """Contact force that ends a control step within the haptic step [N]."""
+        """Limit of the contact force [N]; above it a control step ends within the haptic step."""
         return self.task.limits.hard_force
 
     @property
     def pull_limit(self) -> float:
-        """Likewise the pull of a jaw, of a task with a failure "torn" [N]; else infinite."""
+        """Limit of a jaw's pull [N], likewise; infinite for a task without a failure "torn"."""
         return self.task.limits.tear_force if "torn" in self.failures else math.inf
 
     # ---- an episode --------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class TaskRuntime:
         self.task.command(self.layout.commands(action), instrument)
 
     def observe(self, step: ControlStep, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-        """The observation (n_observation,) after a reset or a control step, and whether a sensor saturated.
+        """The observation (n_observation,) after a reset or a control step, and True if a sensor saturated.
 
         Raises:
             ValueError: a channel's `read` returns a value of another size.
@@ -144,7 +144,7 @@ class TaskRuntime:
     # ---- judgement ---------------------------------------------------------------------------------------------
 
     def judge(self, step: ControlStep) -> Verdict:
-        """End a control step, which was observed unless it has a fault."""
+        """Judgement of a control step, after its observation unless it has a fault."""
         task, before = self.task, self._reached
         end = task.end(step)
         load = step.simulation.tissue_load if task.limits.judges_tissue and not step.fault else None
@@ -164,7 +164,7 @@ class TaskRuntime:
         return self.task.info(None, "") | self._tissue_info(None, "")
 
     def _values(self, step: ControlStep) -> dict[str, float]:
-        """Values of the terms that pay for their change."""
+        """Values of the terms paid per change."""
         return {
             reward.name: float(reward.value(self.task, step))
             for reward in self.task.rewards
@@ -193,7 +193,7 @@ class TaskRuntime:
         return load.pressure > (limits.pressure or math.inf) or load.strain > (limits.strain or math.inf)
 
     def _tissue_info(self, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
-        """Largest pressure [Pa] and strain of the tissue, where the scene's limits judge it; 0 without a load."""
+        """Largest pressure [Pa] and strain of the tissue, for scenes with limits of these; 0 without a load."""
         if not self.task.limits.judges_tissue:
             return {}
         pressure, strain = (0.0, 0.0) if load is None else (load.pressure, load.strain)
@@ -220,7 +220,7 @@ class TaskRuntime:
         return json.dumps(state, default=_array_table)
 
     def saved_organ(self, text: str, anatomy: Anatomy) -> OrganModel:
-        """The organ of the episode whose `get_state` is given; changes nothing.
+        """The organ of a saved episode; changes nothing.
 
         Args:
             text: from `get_state`.
@@ -229,7 +229,7 @@ class TaskRuntime:
         return self.task.setup.drawn.from_json(json.loads(text)["drawn"], anatomy).compiled(anatomy)
 
     def set_state(self, text: str, anatomy: Anatomy) -> None:
-        """Restore a state of `get_state` that `saved_organ` accepted, with the anatomy of that episode."""
+        """Restore a state of `get_state`, accepted by `saved_organ`, with the anatomy of its episode."""
         task, saved = self.task, json.loads(text, object_hook=_array_of)
         task.anatomy = anatomy
         self._take(task.setup.drawn.from_json(saved["drawn"], anatomy))
@@ -280,7 +280,7 @@ def make_runtime(
 
 
 def setting_names(task_class: type[Task]) -> set[str]:
-    """Names of the arguments that `make_runtime` takes beside scene and instrument."""
+    """Names of `make_runtime`'s arguments beside scene and instrument."""
     parameters = [*inspect.signature(make_runtime).parameters.values()]
     parameters += inspect.signature(task_class.__init__).parameters.values()
     return {parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY}
@@ -292,7 +292,7 @@ def _scaled(sensor: ForceSensor, factor: float) -> ForceSensor:
 
 
 def _array_table(value: Any) -> Any:
-    """An array or a number of numpy's in a saved state, as JSON holds it."""
+    """JSON form of an array or a number of numpy's in a saved state."""
     if isinstance(value, np.ndarray):
         return {"array": value.tolist(), "dtype": str(value.dtype)}
     if isinstance(value, np.generic):
@@ -304,5 +304,5 @@ def _array_table(value: Any) -> Any:
 
 
 def _array_of(table: dict[str, Any]) -> Any:
-    """The array of a table that `_array_table` wrote; any other table unchanged."""
+    """Array of a table from `_array_table`; any other table unchanged."""
     return np.array(table["array"], table["dtype"]) if table.keys() == {"array", "dtype"} else table

@@ -26,7 +26,7 @@ class Scenario:
 
     Fields:
         anatomy: of the scene with its instrument, motion and level
-        instrument: that acts on it
+        instrument: of the scene, acting on the organ
         level: of the lesions; None for the scene's own
         family: members that episodes draw from; None for a scene of one organ
         scene: as named, before instrument, motion and level
@@ -124,7 +124,7 @@ class Task:
         """Take in the reset and each control step without a fault, before channels and rewards are read."""
 
     def end(self, step: ControlStep) -> str:
-        """Name of the reason that ends the episode in this control step; "" while it goes on. Called once for each.
+        """Reason of the episode's end in this control step; "" while it goes on. Called once for each.
 
         A declared reward of that name is paid. Failures are "fault", "hard_force", "damage" and the declared ones.
         """

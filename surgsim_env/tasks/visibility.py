@@ -22,7 +22,7 @@ from surgsim_env.tasks.visibility_kernels import (
     hide_behind_triangles,
 )
 
-# Points of a disc that are looked at: enough for a share to be right to about half a percent.
+# Sampled points of a disc: enough for a share to be right to about half a percent.
 POINT_COUNT = 500
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -48,7 +48,7 @@ class Disc:
     def points(self) -> FloatArray:
         """Points spread evenly over the disc as a sunflower's seeds are [m], shape (POINT_COUNT, 3).
 
-        Each stands for as much of the disc's area, not of its picture, in which what is nearer is larger.
+        Each stands for an equal part of the disc's area, not of its projection in a picture.
         """
         index = np.arange(POINT_COUNT)
         distance = self.radius * np.sqrt((index + 0.5) / POINT_COUNT)
@@ -58,9 +58,9 @@ class Disc:
 
 
 def hiding_geoms(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """The shapes of an instrument's model that hide what is behind them: all that is visible or that tissue feels.
+    """Opaque shapes of an instrument's model: primitives that are visible or touch tissue.
 
-    Meshes count by the shapes that tissue feels of them.
+    Meshes count by their contact shapes.
     """
     solid = np.isin(model.geom_type, (PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX))
     seen = (model.geom_group < CONTACT_GROUP) & (model.geom_rgba[:, 3] > 0.0)
@@ -79,16 +79,16 @@ def visible(
     """Visibility of points from an eye.
 
     Args:
-        eye: where the camera stands [m], (3,).
+        eye: position of the camera [m], (3,).
         points: of the target [m], (n, 3).
-        node_position: of the organ's nodes, as deformed as they are [m], (n_node, 3).
+        node_position: of the organ's deformed nodes [m], (n_node, 3).
         triangles: of its whole surface, (m, 3).
         model: an instrument's.
-        data: the same's, poses up to date.
-        geoms: which of its shapes hide, see `hiding_geoms`.
+        data: of the same model, poses up to date.
+        geoms: opaque shapes of the model, see `hiding_geoms`.
 
     Returns:
-        For each point whether nothing stands between it and the eye, shape (n,).
+        True for each point with a free line of sight, shape (n,).
     """
     hidden, cone = _hidden_by(eye, points, node_position, triangles)
     hide_behind_shapes(
@@ -106,7 +106,7 @@ def uncovered(eye: FloatArray, points: FloatArray, node_position: FloatArray, tr
 def _hidden_by(
     eye: FloatArray, points: FloatArray, node_position: FloatArray, triangles: IntArray
 ) -> tuple[NDArray[np.uint8], tuple[FloatArray, FloatArray, FloatArray, float, float, float]]:
-    """1 where triangles hide a point, (n,), and the cone from the eye around the points as kernels take it."""
+    """1 for each point hidden by triangles, (n,), and the kernels' cone from the eye around the points."""
     rays = points - eye
     middle = rays.mean(axis=0)
     distances = norm(rays, axis=1)

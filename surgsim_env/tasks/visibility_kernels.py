@@ -12,7 +12,7 @@ from msdm_core.kernels.space_kernels import edge, minus, row_of, scalar_product
 
 FloatArray = NDArray[np.float64]
 
-# MuJoCo's mjtGeom of the shapes that hide.
+# MuJoCo's mjtGeom of the opaque shapes.
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 
 
@@ -29,16 +29,16 @@ def _near_cone(x, y, z, radius, eye, axis, cosine, sine, reach):
 
 @njit(**KERNEL)
 def hide_behind_triangles(eye, points, axis, cosine, sine, reach, position, triangles, hidden):
-    """Mark the points whose straight way from the eye meets a triangle.
+    """Mark the points hidden from the eye by a triangle.
 
-    In:  eye [m] (3,), points [m] (n, 3), the cone from the eye that holds them all: unit axis (3,), cosine and sine of
+    In:  eye [m] (3,), points [m] (n, 3), the cone from the eye around them: unit axis (3,), cosine and sine of
          its half angle, reach [m]; position of nodes [m] (n_node, 3), triangles (m, 3)
-    Out: hidden (n,): 1 where a way meets one
+    Out: hidden (n,): 1 for a hidden point
     """
     for triangle in range(triangles.shape[0]):
         a, b, c = row_of(triangles, triangle)
         first, ab, ac = row_of(position, a), edge(position, a, b), edge(position, a, c)
-        # A ball about corner a that holds the triangle.
+        # Radius of a ball about corner a around the triangle.
         size = math.sqrt(max(scalar_product(ab, ab), scalar_product(ac, ac)))
         if not _near_cone(first[0], first[1], first[2], size, eye, axis, cosine, sine, reach):
             continue
@@ -123,11 +123,11 @@ def _meets_shape(kind, size, x, y, z, dx, dy, dz, limits):
 def hide_behind_shapes(
     eye, points, axis, cosine, sine, reach, geoms, kind, size, ball, position, rotation, limits, hidden
 ):
-    """Mark the points whose straight way from the eye meets one of MuJoCo's shapes.
+    """Mark the points hidden from the eye by a MuJoCo shape.
 
-    In:  eye to reach: as in `hide_behind_triangles`; geoms: which of MuJoCo's are looked at; geom_type (n_geom,),
+    In:  eye to reach: as in `hide_behind_triangles`; geoms: opaque shapes of the model; geom_type (n_geom,),
          geom_size (n_geom, 3), geom_rbound (n_geom,), geom_xpos (n_geom, 3), geom_xmat (n_geom, 9)
-    Out: hidden (n,): 1 where a way meets one; scratch: limits (3,)
+    Out: hidden (n,): 1 for a hidden point; scratch: limits (3,)
     """
     for place in range(geoms.shape[0]):
         geom = geoms[place]

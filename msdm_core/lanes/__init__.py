@@ -1,10 +1,10 @@
 """Vectorised organs, side by side in vector registers."""
 
-from msdm_core.lanes.lanes import lane_responses, lanes_of, stack_organs, stack_shapes
+from msdm_core.lanes.lanes import lane_responses, stack_organs, stack_shapes, stack_states
 
 __all__ = [
     "lane_responses",
-    "lanes_of",
     "stack_organs",
     "stack_shapes",
+    "stack_states",
 ]

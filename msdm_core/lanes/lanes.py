@@ -190,7 +190,7 @@ def _write(array: NDArray[Any], place: Any, values: Any) -> None:
     array.setflags(write=False)
 
 
-def lanes_of(
+def stack_states(
     states: Sequence[OrganState],
     first: OrganModel,
     *,

@@ -9,7 +9,7 @@ import numpy as np
 
 from msdm_core.arithmetic import exp
 from msdm_core.kernels import FAULT_NONE, LaneState, OrganModel, OrganState, advance_substeps, lane_counts
-from msdm_core.lanes import lane_responses, lanes_of, stack_organs, stack_shapes
+from msdm_core.lanes import lane_responses, stack_organs, stack_shapes, stack_states
 from msdm_core.material import Damping, Material, Relaxation, Stiffening
 from msdm_core.meshing import box_mesh
 from msdm_core.organ import NO_CONTACT, NO_SHAPES, OrganSpec, advance_organ, compile_organ, rest_state
@@ -70,7 +70,7 @@ def abreast(model: OrganModel, dtype: type = np.float64, *, shear: float = 0.01,
     """Seconds of one substep of each of many organs side by side in vector registers; otherwise as `single`."""
     lanes = lane_counts(dtype)[0]
     organs = stack_organs([model] * lanes, dtype=dtype)
-    state = lanes_of([rest_state(model)] * lanes, model, dtype=dtype)
+    state = stack_states([rest_state(model)] * lanes, model, dtype=dtype)
     shapes, wrench = stack_shapes([NO_SHAPES] * lanes, lanes), np.zeros((lanes, 0, 6))
     dt = 0.5 * model.stable_step if dt is None else dt
     decay, response, reference = float(exp(-model.alpha * dt)), lane_responses(0, lanes), shapes.tool_centre

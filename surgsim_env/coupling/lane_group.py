@@ -12,12 +12,12 @@ from msdm_core.lanes.lanes import (
     get_lane,
     lane_responses,
     lane_shapes,
-    lanes_of,
     put_lane,
     same_rest,
     set_lane,
     stack_organs,
     stack_shapes,
+    stack_states,
 )
 from surgsim_env.coupling.exchange import step_outcome, step_plan, steps_taken
 from surgsim_env.coupling.haptic_kernels import advance_lane_haptic_steps
@@ -97,7 +97,9 @@ class LaneGroup:
         self._own_rest = not all(same_rest(self._organs[0], organ) for organ in self._organs)
         settings: dict[str, Any] = {"dtype": self._dtype, "lanes": self._lanes, "own_rest": self._own_rest}
         self._model = stack_organs(self._organs, **settings)
-        self._state = lanes_of([simulation.organ_state for simulation in self.simulations], self._organs[0], **settings)
+        self._state = stack_states(
+            [simulation.organ_state for simulation in self.simulations], self._organs[0], **settings
+        )
 
     def _load(self, lane: int, simulation: Simulation) -> None:
         simulation.begin_in_lanes()

@@ -10,7 +10,7 @@ from msdm_core.kernels.element_kernels import STEEP_EXCESS, STRAIN_LEAST, node_l
 from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, hold_steep
 from msdm_core.kernels.structure_kernels import FAULT_NONE, KEPT_NAMES, ContactLaw, OrganModel, OrganState
 from msdm_core.kernels.vector_kernels import GROUP
-from msdm_core.lanes.lanes import get_lane, lane_responses, lanes_of, put_lane, stack_organs, stack_shapes
+from msdm_core.lanes.lanes import get_lane, lane_responses, put_lane, stack_organs, stack_shapes, stack_states
 from msdm_core.material.regions import Damping, Lesion, Material
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -199,7 +199,7 @@ def test_lanes_move_as_organs_alone(dtype: type):
     organs = [block(LIVER, ARMS), block(LIVER, ARMS, youngs_modulus=8000.0), block(LIVER, ARMS, lesions=(lesion,))]
     states = [strained(organ, 0.05, seed) for seed, organ in enumerate(organs)]
     lanes = stack_organs(organs, dtype=dtype)
-    together = lanes_of(states, organs[0], dtype=dtype)
+    together = stack_states(states, organs[0], dtype=dtype)
     count = len(together.lane_fault)
     shapes = stack_shapes([NO_SHAPES] * 3, lanes=count)
     dt = 0.5 * min(stable_dt(organ) for organ in organs)
@@ -237,7 +237,7 @@ def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
         above = middles[middles[:, 2].argmax()] + np.array([0.0, 0.0, 0.003])
         balls.append(round_shapes([[above, above]], [0.004], twist=[[0.0, 0.0, -0.02, 0.0, 0.0, 0.0]]))
     contact = ContactLaw(stiffness=2e7, damping=500.0, friction=0.4, tangential_stiffness=1e7)
-    lanes, together, count = stack_organs(organs), lanes_of(states, organs[0]), 8
+    lanes, together, count = stack_organs(organs), stack_states(states, organs[0]), 8
     shapes, pushes = stack_shapes(balls), np.zeros((count, 1, 6))
     dt = 0.5 * min(stable_dt(organ, contact) for organ in organs)
     needed, highest_push = np.zeros(3), np.zeros(3)

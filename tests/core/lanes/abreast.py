@@ -16,7 +16,7 @@ from msdm_core.kernels.structure_kernels import (
     ToolResponse,
 )
 from msdm_core.kernels.substep_kernels import advance_substeps
-from msdm_core.lanes.lanes import lane_responses, lanes_of
+from msdm_core.lanes.lanes import lane_responses, stack_states
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import rest_state
 
@@ -34,7 +34,7 @@ def rest_lanes(
     Lanes beyond the organs are empty (LANE_EMPTY) and do not move. Under gravity each organ is settled (`rest_state`).
     """
     resting = [rest_state(organ, shape_count=shape_count) for organ in organs]
-    return lanes_of(resting, organs[0], dtype=dtype, lanes=lanes, own_rest=own_rest)
+    return stack_states(resting, organs[0], dtype=dtype, lanes=lanes, own_rest=own_rest)
 
 
 def advance_lanes(

@@ -46,7 +46,9 @@ def frame(env: gym.Env, cameras: tuple[str, ...] = ("overview",)) -> Image.Image
     inner = env.unwrapped
     assert isinstance(inner, SurgicalEnv)
     drawn = [Image.fromarray(inner.renderer.rgb(camera)) for camera in cameras]
-    return Image.fromarray(np.concatenate([np.asarray(one.resize(SIZE, Image.Resampling.LANCZOS)) for one in drawn], 1))
+    return Image.fromarray(
+        np.concatenate([np.asarray(picture.resize(SIZE, Image.Resampling.LANCZOS)) for picture in drawn], 1)
+    )
 
 
 def make(id: str, **arguments: Any) -> gym.Env:
@@ -83,7 +85,7 @@ def film_presses(path: Path, *, seed: int) -> None:
 
 
 def draw_tutorial(name: str, path: Path) -> None:
-    """What the tutorial on one's own organ or robot shows, by its own code."""
+    """The picture of a tutorial on one's own organ or robot, by its code."""
     text = (Path(__file__).parent / "tutorials" / f"own_{name}.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

@@ -21,11 +21,11 @@ FloatArray = NDArray[np.float64]
 
 
 def displacement(name: str, time: FloatArray) -> FloatArray:
-    """How far the ground of the liver's upper end moves in an episode of a preset [m], (n_time,)."""
+    """Ground displacement at the liver's upper end in an episode of a preset [m], (n_time,)."""
     scene = with_motion(make_scene("liver"), name)
     drive = draw_drive(scene.motions, scene.timing.haptic_step, np.random.default_rng(SEED))
     ways = np.array([motion.displacement for motion in scene.motions])
-    return np.array([np.linalg.norm(signals(drive, one) @ ways) for one in time])
+    return np.array([np.linalg.norm(signals(drive, moment) @ ways) for moment in time])
 
 
 def held_force(*, tracks: bool) -> tuple[FloatArray, FloatArray]:

@@ -63,7 +63,7 @@ def cleaned(notebook: NotebookNode) -> NotebookNode:
     for number, cell in enumerate(kept.cells):
         cell.id, cell.metadata = f"cell-{number}", nbformat.from_dict({})
         if cell.cell_type == "code":
-            cell.outputs = [_small(one) for one in cell.outputs if one.get("name") != "stderr"]
+            cell.outputs = [_small(output) for output in cell.outputs if output.get("name") != "stderr"]
     return kept
 
 

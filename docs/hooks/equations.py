@@ -20,8 +20,8 @@ TAG = re.compile(r"\\tag\{([^}]*)\}")
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Replace each equation of a page's HTML."""
     place = page.file.src_uri
-    content = DISPLAYED.sub(lambda found: _displayed(html.unescape(found[1]), place), content)
-    return INLINE.sub(lambda found: math(html.unescape(found[1]), place), content)
+    content = DISPLAYED.sub(lambda match: _displayed(html.unescape(match[1]), place), content)
+    return INLINE.sub(lambda match: math(html.unescape(match[1]), place), content)
 
 
 def math(latex: str, place: str, *, display: str = "inline") -> str:

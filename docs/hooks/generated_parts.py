@@ -41,11 +41,13 @@ def environment_text(id: str) -> str:
     """
     from surgsim_env.tasks.declaration import HEADINGS, docstring_sections
 
-    summary, told = docstring_sections(environment_class(id).__doc__ or "")
-    if tuple(told) != HEADINGS:
-        raise PluginError(f"{id}: the docstring has the headings {', '.join(told)}; it must have {', '.join(HEADINGS)}")
+    summary, sections = docstring_sections(environment_class(id).__doc__ or "")
+    if tuple(sections) != HEADINGS:
+        raise PluginError(
+            f"{id}: the docstring has the headings {', '.join(sections)}; it must have {', '.join(HEADINGS)}"
+        )
     make = f'```python\nimport gymnasium as gym\nimport surgsim_env\n\nenv = gym.make("{id}")\n```'
-    parts = [make, summary_table(id), *(f"## {title}\n\n{_lists_apart(text)}" for title, text in told.items())]
+    parts = [make, summary_table(id), *(f"## {title}\n\n{_lists_apart(text)}" for title, text in sections.items())]
     return "\n\n".join([summary, *parts])
 
 
@@ -64,7 +66,7 @@ def environment_class(id: str) -> type:
 
 
 def summary_table(id: str) -> str:
-    """What Gymnasium's registry and the environment itself say."""
+    """A table from Gymnasium's registry and the environment."""
     import gymnasium as gym
 
     env: Any = gym.make(id)
@@ -112,9 +114,9 @@ def field_table(structure: str) -> str:
 def command_list() -> str:
     """A table of all commands, then a section each, as Markdown."""
     (names,) = re.findall(r"^usage: surgsim .*\{([\w,]+)\}", said("--help"), flags=re.MULTILINE)
-    told = {name: said(name, "--help") for name in names.split(",")}
-    rows = [f"| [`{name}`](#surgsim-{name}) | {_first_sentence(text)} |" for name, text in told.items()]
-    return "\n".join(["| command | |", "|---|---|", *rows, "", *(_section(name, text) for name, text in told.items())])
+    texts = {name: said(name, "--help") for name in names.split(",")}
+    rows = [f"| [`{name}`](#surgsim-{name}) | {_first_sentence(text)} |" for name, text in texts.items()]
+    return "\n".join(["| command | |", "|---|---|", *rows, "", *(_section(name, text) for name, text in texts.items())])
 
 
 def said(*arguments: str) -> str:
@@ -133,7 +135,12 @@ def _section(name: str, text: str) -> str:
     lines = [f"## surgsim {name}\n", f"```text\n{usage}\n```\n", description, ""]
     for title, rows in tables:
         if rows:
-            lines += [f"| {title} | |", "|---|---|", *(f"| {_code(what)} | {_cell(told)} |" for what, told in rows), ""]
+            lines += [
+                f"| {title} | |",
+                "|---|---|",
+                *(f"| {_code(what)} | {_cell(help_text)} |" for what, help_text in rows),
+                "",
+            ]
     return "\n".join(lines)
 
 
@@ -153,14 +160,14 @@ def _rows(body: str) -> list[tuple[str, str]]:
         if not set(content) - set("-─ "):
             continue
         if re.match(r" {1,3}\S", content):
-            what, *told = re.split(r" {2,}", content.strip(), maxsplit=1)
-            rows.append((what, " ".join(told)))
+            what, *rest = re.split(r" {2,}", content.strip(), maxsplit=1)
+            rows.append((what, " ".join(rest)))
         elif rows:
-            what, told = rows[-1]
-            rows[-1] = (what, f"{told} {content.strip()}".strip())
+            what, help_text = rows[-1]
+            rows[-1] = (what, f"{help_text} {content.strip()}".strip())
     # tyro marks optional values as {None}|PATH ... (default: None).
     none = re.compile(r"\{None\}\||\s*\(default: (?:None)?\)")
-    return [(none.sub("", what), none.sub("", told)) for what, told in rows if what != "-h, --help"]
+    return [(none.sub("", what), none.sub("", help_text)) for what, help_text in rows if what != "-h, --help"]
 
 
 def _first_sentence(text: str) -> str:

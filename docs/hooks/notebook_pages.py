@@ -69,8 +69,8 @@ def page_of(notebook: dict[str, Any], name: str) -> tuple[str, dict[str, bytes]]
                 pictures[place] = base64.b64decode("".join(data[PNG]))
                 parts.append(f"![{heading}]({place})")
             elif output["output_type"] == "stream" or "text/plain" in data:
-                said = "".join(output.get("text", data.get("text/plain", "")))
-                parts.append(f'```text title="prints"\n{said.rstrip()}\n```')
+                text = "".join(output.get("text", data.get("text/plain", "")))
+                parts.append(f'```text title="prints"\n{text.rstrip()}\n```')
             else:
                 raise PluginError(f"{name}.ipynb: an output of the kind {output['output_type']!r} cannot be shown")
     parts.insert(1, f"[Save this notebook]({name}.ipynb){{ download={name}.ipynb }}")
@@ -80,10 +80,10 @@ def page_of(notebook: dict[str, Any], name: str) -> tuple[str, dict[str, bytes]]
 def title_of(path: Path) -> str:
     """The first heading of a notebook."""
     first = json.loads(path.read_text(encoding="utf-8"))["cells"][0]
-    found = HEADING.search("".join(first["source"]))
-    if found is None:
+    match = HEADING.search("".join(first["source"]))
+    if match is None:
         raise PluginError(f"{path.name}: its first cell has no heading")
-    return found[1]
+    return match[1]
 
 
 def _notebooks(config: MkDocsConfig) -> list[Path]:

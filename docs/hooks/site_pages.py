@@ -1,4 +1,4 @@
-"""Which pages there are and how they name each other.
+"""The site's pages and their links to each other.
 
 Pages of the repository that do not lie in docs/ have their place on the site too; their pictures come along. Where a
 page names another one by its path, as `docs/arms.md`, the site has a link with that page's title.
@@ -66,12 +66,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         page.meta["hide"] = [*page.meta.get("hide", []), "toc"]
     here = posixpath.dirname(page.file.src_uri)
 
-    def link(found: re.Match[str]) -> str:
-        name = found[1] or found[2]
+    def link(match: re.Match[str]) -> str:
+        name = match[1] or match[2]
         place = OUTSIDE.get(name) or name.removeprefix("docs/")
         target = files.get_file_from_path(place) if NAMED.fullmatch(name) else None
         if target is None or target is page.file or not target.inclusion.is_included():
-            return found[0]
+            return match[0]
         heading = re.search(r"^# (.+)$", target.content_string, re.MULTILINE)
         return f"[{heading[1].strip() if heading else name}]({posixpath.relpath(place, here or '.')})"
 

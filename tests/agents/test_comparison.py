@@ -100,6 +100,6 @@ def test_episodes_without_lesions_do_not_count_for_presses():
     ],
 )
 def test_results_of_other_episodes_are_refused(changes: dict[str, object], message: str):
-    one = result("one", falling(np.full(40, 3)))
+    method = result("one", falling(np.full(40, 3)))
     with pytest.raises(ValueError, match=message):
-        compare(one, replace(one, method="other", **changes), np.random.default_rng(0))  # type: ignore[arg-type]
+        compare(method, replace(method, method="other", **changes), np.random.default_rng(0))  # type: ignore[arg-type]

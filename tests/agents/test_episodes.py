@@ -1,4 +1,4 @@
-"""How episodes are played for scores: agents' random numbers, lanes without a seed, and who sees the truth."""
+"""Episodes played for scores: agents' random numbers, lanes without a seed, and who sees the truth."""
 
 from collections.abc import Callable
 from dataclasses import replace

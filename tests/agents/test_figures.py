@@ -57,7 +57,7 @@ def test_who_sees_the_truth_has_all_of_it() -> None:
     records = []
     for count in (0, 1, 2, 3, 1, 1):
         truth = places(rng, count)
-        lesion = np.any([disc(one) for one in truth], axis=0) if count else np.zeros((21, 21), dtype=bool)
+        lesion = np.any([disc(place) for place in truth], axis=0) if count else np.zeros((21, 21), dtype=bool)
         records.append(record(truth, [truth] * BUDGET, map_of(lesion.astype(float), lesion)))
     figures = score(records, BUDGET, rng)
     for name in ("recall", "precision", "count_right", "outline_iou", "auroc", "average_precision"):
@@ -76,7 +76,7 @@ def test_who_guesses_the_middle_has_what_chance_predicts() -> None:
     for _ in range(600):
         truth = places(rng, 1)
         records.append(record(truth, [middle] * BUDGET, map_of(rng.random((21, 21)), disc(truth[0]))))
-    distance = np.array([1000.0 * np.linalg.norm(one.truth - middle) for one in records])
+    distance = np.array([1000.0 * np.linalg.norm(episode.truth - middle) for episode in records])
     figures = score(records, BUDGET, rng)
     by_chance = 1000.0 * SIDE * (math.sqrt(2.0) + math.asinh(1.0)) / 6.0
     assert figures["error_mm"].value == pytest.approx(by_chance, abs=4.0 * distance.std() / math.sqrt(600))
@@ -109,8 +109,8 @@ def test_an_episode_that_ended_early_keeps_its_last_error() -> None:
 def test_missed_and_imagined_lesions_count() -> None:
     """Of two lesions one is found 4 mm off; of three estimates two are nowhere near."""
     truth = np.array([[0.01, 0.01, 0.0], [0.03, 0.03, 0.0]])
-    said = np.array([[0.014, 0.01, 0.0], [0.01, 0.035, 0.0], [0.0, 0.04, 0.0]])
-    figures = score([record(truth, [said])], 1, np.random.default_rng(0))
+    estimates = np.array([[0.014, 0.01, 0.0], [0.01, 0.035, 0.0], [0.0, 0.04, 0.0]])
+    figures = score([record(truth, [estimates])], 1, np.random.default_rng(0))
     assert figures["recall"].value == pytest.approx(1.0 / 2.0)
     assert figures["precision"].value == pytest.approx(1.0 / 3.0)
     assert figures["centroid_error_mm"].value == pytest.approx(4.0)
@@ -138,7 +138,7 @@ def test_intervals_are_those_of_the_mean() -> None:
     rng = np.random.default_rng(4)
     truth = np.zeros((1, 3))
     offsets = rng.uniform(0.0, 0.02, 400)
-    figure = score([record(truth, [truth + np.array([one, 0.0, 0.0])]) for one in offsets], 1, rng)["error_mm"]
+    figure = score([record(truth, [truth + np.array([offset, 0.0, 0.0])]) for offset in offsets], 1, rng)["error_mm"]
     half = 1.96 * 1000.0 * offsets.std() / math.sqrt(400)
     assert figure.value == pytest.approx(1000.0 * offsets.mean())
     # 2000 draws: the ends are known to some 4 % of the half width.

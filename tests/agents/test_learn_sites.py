@@ -71,7 +71,7 @@ def test_processes_play_the_same_episodes():
 
 def test_the_cost_is_lower_the_earlier_a_lesion_is_found():
     assert [presses_to_stay(np.array(episode), 5.0) for episode in ([4.0, 3.0], [9.0, 4.0], [4.0, 9.0])] == [1, 2, 3]
-    early, late = (np.where(np.arange(25) < found, 20.0, 1.0) for found in (5, 15))
+    early, late = (np.where(np.arange(25) < presses, 20.0, 1.0) for presses in (5, 15))
     # Means 4.8 and 12.4 mm over 20 mm; 6 and 16 of 25 presses; above 5 mm after 0 and 8 of the presses 8 to 20, where
     # errors of 1 and 20 mm count as 1 / (1 + e^4) and 1.
     low = 1.0 / (1.0 + np.exp(4.0))

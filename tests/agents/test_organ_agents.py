@@ -223,7 +223,7 @@ def test_the_committed_policy_takes_any_organ(scene):
 
 
 def test_the_committed_policy_does_as_it_was_taught(first):
-    """Where the expert slides, crosses and declares, so does the network."""
+    """The network slides, crosses and declares where the expert does."""
     import torch
 
     from agents.learn_palpate_organs import imagined

@@ -62,7 +62,7 @@ def test_the_expert_follows_from_the_observation_alone():
 
 
 def test_forces_are_those_entries_of_the_observation():
-    """Where the jaw presses tissue, they alone tell the wrench, grip and pull."""
+    """The wrench, grip and pull on tissue are in these entries alone."""
     env = gym.make(ID, scaled=False)
     observation, _ = env.reset(seed=3)
     assert env.unwrapped.layout.force_entries == list(range(13, 21))

@@ -91,9 +91,9 @@ def test_without_the_library_the_plain_loop_runs_and_says_so_once(monkeypatch):
         warnings.simplefilter("error")
         assert gym.make("SurgSim/Palpate-v0").unwrapped.simulation.compiled is False
     plain = pair("phantom")[1]
-    for one in (env, plain):
-        one.reset(seed=6)
-        one.step(DOWN)
+    for environment in (env, plain):
+        environment.reset(seed=6)
+        environment.step(DOWN)
     assert env.save_state() == plain.save_state()
     model, state = free_organ()
     with pytest.raises(RuntimeError, match=reason):

@@ -38,9 +38,9 @@ def pair(scene, instrument=None):
 
 def assert_same(compiled, plain, action):
     """One control step of both; everything that can be seen or saved is the same to the bit."""
-    one, other = compiled.step(action), plain.step(action)
-    assert one[0].tobytes() == other[0].tobytes()
-    assert one[1:] == other[1:]
+    result, other = compiled.step(action), plain.step(action)
+    assert result[0].tobytes() == other[0].tobytes()
+    assert result[1:] == other[1:]
     ours, theirs = compiled.simulation, plain.simulation
     assert ours.contact_wrench.tobytes() == theirs.contact_wrench.tobytes()
     assert (ours.time, ours.fault) == (theirs.time, theirs.fault)
@@ -50,7 +50,7 @@ def assert_same(compiled, plain, action):
     for name, array in theirs.get_state().items():
         assert ours.get_state()[name].tobytes() == array.tobytes(), name
     assert compiled.save_state() == plain.save_state()
-    return one
+    return result
 
 
 def press(both, seed, count):
@@ -156,9 +156,9 @@ def test_faults_are_the_same(harm, message):
 def test_a_fault_in_mid_step_is_the_same():
     """A ram at 0.3 m/s turns a tet inside out after some 65 haptic steps: those count, with their largest force."""
     compiled, plain = (env.simulation for env in on_phantom())
-    for one in (compiled, plain):
-        one.instrument.command_velocity(np.array([0.0, 0.0, -0.3]))
-    peaks = [one.control_step(600) for one in (compiled, plain)]
+    for simulation in (compiled, plain):
+        simulation.instrument.command_velocity(np.array([0.0, 0.0, -0.3]))
+    peaks = [simulation.control_step(600) for simulation in (compiled, plain)]
     assert peaks[0] == peaks[1] > 2.0
     assert "turned inside out" in compiled.fault and 0.05 < compiled.time < 0.1
     for name, array in plain.get_state().items():

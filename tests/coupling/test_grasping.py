@@ -22,27 +22,27 @@ def simulation(model: str, *, compiled: bool = True) -> Simulation:
     return made
 
 
-def run(one: Simulation, steps: int, velocity=(0.0, 0.0, 0.0), turning=None) -> None:
+def run(sim: Simulation, steps: int, velocity=(0.0, 0.0, 0.0), turning=None) -> None:
     """Control steps at a steady velocity."""
     for _ in range(steps):
-        one.instrument.command_velocity(np.array(velocity), turning)
-        one.control_step(50)
-        assert not one.fault, one.fault
-        assert one.end_control_step(), one.fault
+        sim.instrument.command_velocity(np.array(velocity), turning)
+        sim.control_step(50)
+        assert not sim.fault, sim.fault
+        assert sim.end_control_step(), sim.fault
 
 
 @pytest.mark.parametrize("model", JAWS)
 def test_the_jaw_starts_open_and_level(model: str):
     """Around the slab's edge: nothing touches; the pads look at each other along z."""
-    one = simulation(model)
-    jaw = one.instrument.jaw
+    sim = simulation(model)
+    jaw = sim.instrument.jaw
     assert jaw.opening > 0.018
-    np.testing.assert_allclose(one.instrument.tip_position, HOLD, atol=1e-9)
+    np.testing.assert_allclose(sim.instrument.tip_position, HOLD, atol=1e-9)
     mean = jaw.normals[0] - jaw.normals[1]
     np.testing.assert_allclose(np.abs(mean / np.linalg.norm(mean)), [0.0, 0.0, 1.0], atol=1e-6)
-    run(one, 1)
-    assert not one.contact_wrench.any()
-    grasp = one.grasp
+    run(sim, 1)
+    assert not sim.contact_wrench.any()
+    grasp = sim.grasp
     assert grasp.opening == jaw.opening and not grasp.holds
     assert grasp.grip_force == grasp.pull_force == grasp.friction_left == 0.0
 
@@ -50,80 +50,80 @@ def test_the_jaw_starts_open_and_level(model: str):
 @pytest.mark.parametrize("model", JAWS)
 def test_a_closed_jaw_grips_with_its_joints_force(model: str):
     """At rest each pad's force is what its joint may push with; opened again, nothing of it is left."""
-    one = simulation(model)
-    one.instrument.command_jaw(-1.0)
-    run(one, 40)
-    grasp = one.grasp
+    sim = simulation(model)
+    sim.instrument.command_jaw(-1.0)
+    run(sim, 40)
+    grasp = sim.grasp
     print(f"\n{model}: {grasp}")
     assert grasp.holds
     assert grasp.grip_force == pytest.approx(PAD_FORCE[model], rel=0.05)
     assert 0.002 < grasp.opening < 0.012
     # Nobody pulls, but the squeezed slab grows away from its wall and drags the pads along, as far as they stick.
     assert grasp.pull_force < 0.4 * PAD_FORCE[model]
-    assert grasp.friction_left > 1.2 * one.contact.friction * 4.0 * PAD_FORCE[model]
-    one.instrument.command_jaw(1.0)
-    run(one, 20)
-    assert one.grasp.opening > 0.018
-    assert not one.contact_wrench.any() and not one.grasp.holds
-    assert np.abs(one.organ_state.node_position - one.organ_model.node_rest_position).max() < 1e-4
+    assert grasp.friction_left > 1.2 * sim.contact.friction * 4.0 * PAD_FORCE[model]
+    sim.instrument.command_jaw(1.0)
+    run(sim, 20)
+    assert sim.grasp.opening > 0.018
+    assert not sim.contact_wrench.any() and not sim.grasp.holds
+    assert np.abs(sim.organ_state.node_position - sim.organ_model.node_rest_position).max() < 1e-4
 
 
 @pytest.mark.parametrize("model", JAWS)
 def test_a_restart_forgets_where_the_jaw_was_told_to_go(model: str):
     """Opened again and stopped on its way: restarted it is as the first time, and stays open."""
-    one = simulation(model)
-    first = one.instrument.get_state()
+    sim = simulation(model)
+    first = sim.instrument.get_state()
     for target in (-1.0, -0.3):
-        one.instrument.command_jaw(target)
-        run(one, 10)
-    one.restart(HOLD)
-    assert one.instrument.get_state().tobytes() == first.tobytes()
-    one.control_step(1)
-    assert one.instrument.jaw.target == pytest.approx(1.0, abs=1e-12)
+        sim.instrument.command_jaw(target)
+        run(sim, 10)
+    sim.restart(HOLD)
+    assert sim.instrument.get_state().tobytes() == first.tobytes()
+    sim.control_step(1)
+    assert sim.instrument.jaw.target == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("model", JAWS)
 def test_no_joint_of_the_jaw_pushes_beyond_its_range(model: str):
-    one = simulation(model)
-    one.instrument.command_jaw(-1.0)
-    model_, data = one.instrument.model, one.instrument.data
+    sim = simulation(model)
+    sim.instrument.command_jaw(-1.0)
+    model_, data = sim.instrument.model, sim.instrument.data
     fingers = [j for j in range(model_.njnt) if model_.joint(j).name.startswith("finger")]
     limit = model_.jnt_actfrcrange[fingers, 1]
     for _ in range(30):
-        run(one, 1)
+        run(sim, 1)
         assert (np.abs(data.qfrc_actuator[model_.jnt_dofadr[fingers]]) <= limit + 1e-12).all()
     assert np.abs(data.qfrc_actuator[model_.jnt_dofadr[fingers]]) == pytest.approx(limit)
 
 
 def test_turning_the_wrist_leaves_the_tip_where_it_is():
     """The hinge lies 22 mm behind: between control steps the tip leaves its place by 22 mm (1 - cos(0.025))."""
-    one = simulation("grasper.xml")
-    one.restart(HOLD + np.array([0.0, 0.04, 0.02]))
-    start, pitch = one.instrument.tip_position, one.instrument.pitch
-    run(one, 20, turning=np.array([1.0]))
-    assert one.instrument.pitch - pitch == pytest.approx(1.0, abs=2e-3)
-    np.testing.assert_allclose(one.instrument.tip_position, start, atol=2e-5)
-    run(one, 10, velocity=(0.01, 0.0, 0.0), turning=np.array([-1.0]))
-    np.testing.assert_allclose(one.instrument.tip_position, start + np.array([0.005, 0.0, 0.0]), atol=1e-4)
-    assert not one.instrument.workspace_limited
-    run(one, 80, turning=np.array([1.0]))
-    assert one.instrument.workspace_limited
-    assert one.instrument.pitch == pytest.approx(1.9, abs=2e-3)
+    sim = simulation("grasper.xml")
+    sim.restart(HOLD + np.array([0.0, 0.04, 0.02]))
+    start, pitch = sim.instrument.tip_position, sim.instrument.pitch
+    run(sim, 20, turning=np.array([1.0]))
+    assert sim.instrument.pitch - pitch == pytest.approx(1.0, abs=2e-3)
+    np.testing.assert_allclose(sim.instrument.tip_position, start, atol=2e-5)
+    run(sim, 10, velocity=(0.01, 0.0, 0.0), turning=np.array([-1.0]))
+    np.testing.assert_allclose(sim.instrument.tip_position, start + np.array([0.005, 0.0, 0.0]), atol=1e-4)
+    assert not sim.instrument.workspace_limited
+    run(sim, 80, turning=np.array([1.0]))
+    assert sim.instrument.workspace_limited
+    assert sim.instrument.pitch == pytest.approx(1.9, abs=2e-3)
     with pytest.raises(ValueError, match=r"turning has shape \(3,\); instrument 'grasper' takes \(1,\)"):
-        one.instrument.command_velocity(np.zeros(3), np.zeros(3))
+        sim.instrument.command_velocity(np.zeros(3), np.zeros(3))
 
 
 def test_an_arm_turns_the_jaw_with_its_whole_frame():
     """Half a radian about x, across the jaw: it lifts, its pads do not roll, its middle stays."""
-    one = simulation("psm_retractor")
-    one.restart(HOLD + np.array([0.0, 0.03, 0.02]))
-    start, frame = one.instrument.tip_position, one.instrument.steered.tip_rotation
-    run(one, 10, turning=np.array([-1.0, 0.0, 0.0]))
-    run(one, 4)
+    sim = simulation("psm_retractor")
+    sim.restart(HOLD + np.array([0.0, 0.03, 0.02]))
+    start, frame = sim.instrument.tip_position, sim.instrument.steered.tip_rotation
+    run(sim, 10, turning=np.array([-1.0, 0.0, 0.0]))
+    run(sim, 4)
     c, s = np.cos(0.5), np.sin(0.5)
     turned = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ frame
-    np.testing.assert_allclose(one.instrument.steered.tip_rotation, turned, atol=2e-3)
-    np.testing.assert_allclose(one.instrument.tip_position, start, atol=5e-5)
+    np.testing.assert_allclose(sim.instrument.steered.tip_rotation, turned, atol=2e-3)
+    np.testing.assert_allclose(sim.instrument.tip_position, start, atol=5e-5)
 
 
 def test_what_a_grasp_tells():
@@ -150,16 +150,16 @@ def test_what_a_grasp_tells():
     assert read_grasp(None, wrench, friction=0.2) is None
 
 
-def pulled(one: Simulation, pull_limit: float) -> int:
+def pulled(sim: Simulation, pull_limit: float) -> int:
     """Close, then pull away along y until the pull passes a limit; how many control steps that took."""
-    one.instrument.command_jaw(-1.0)
-    run(one, 20)
+    sim.instrument.command_jaw(-1.0)
+    run(sim, 20)
     for step in range(60):
-        one.instrument.command_velocity(np.array([0.0, 0.02, 0.01]))
-        one.control_step(50, np.inf, pull_limit)
-        assert not one.fault
-        one.instrument.refresh()
-        if one.pull_peak > pull_limit:
+        sim.instrument.command_velocity(np.array([0.0, 0.02, 0.01]))
+        sim.control_step(50, np.inf, pull_limit)
+        assert not sim.fault
+        sim.instrument.refresh()
+        if sim.pull_peak > pull_limit:
             return step
     raise AssertionError("the pull never passed its limit")
 
@@ -183,9 +183,9 @@ def test_lanes_stop_at_the_pull_limit_too():
     """Two side by side, one of which pulls: each as it would alone, to the bit."""
     together = [simulation("grasper.xml") for _ in range(2)]
     apart = [simulation("grasper.xml") for _ in range(2)]
-    for one in (*together, *apart):
-        one.instrument.command_jaw(-1.0)
-        run(one, 20)
+    for sim in (*together, *apart):
+        sim.instrument.command_jaw(-1.0)
+        run(sim, 20)
     group = LaneGroup(together)
     stopped = 0
     for _ in range(40):
@@ -193,14 +193,14 @@ def test_lanes_stop_at_the_pull_limit_too():
             pair[0].instrument.command_velocity(np.array([0.0, 0.02, 0.01]))
             pair[1].instrument.command_velocity(np.zeros(3))
         group.control_step(together, 50, np.inf, 0.25)
-        for one, other in zip(together, apart, strict=True):
-            assert one.force_peak == other.control_step(50, np.inf, 0.25) == other.force_peak
-            assert one.pull_peak == other.pull_peak
-            assert one.time == other.time
-            one.instrument.refresh()
+        for lane, other in zip(together, apart, strict=True):
+            assert lane.force_peak == other.control_step(50, np.inf, 0.25) == other.force_peak
+            assert lane.pull_peak == other.pull_peak
+            assert lane.time == other.time
+            lane.instrument.refresh()
             other.instrument.refresh()
             for name, array in other.get_state().items():
-                assert one.get_state()[name].tobytes() == array.tobytes(), name
+                assert lane.get_state()[name].tobytes() == array.tobytes(), name
         stopped = together[0].pull_peak > 0.25
         if stopped:
             break

@@ -33,12 +33,12 @@ def test_the_torque_is_about_the_tip():
     env = Reader(gym.make("SurgSim/Retract-v0"))
     env.reset(seed=0)
     run_script(env, oracle_script(env))
-    found, wanted = (np.array(part) for part in zip(*env.wrenches))
+    wrenches, wanted = (np.array(part) for part in zip(*env.wrenches))
     assert np.abs(wanted[:, 3:]).max() > 1e-3
-    np.testing.assert_allclose(found[:, :3], wanted[:, :3], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(wrenches[:, :3], wanted[:, :3], rtol=1e-5, atol=1e-7)
     # Levers are of the start of the last haptic step of 1 ms: the tip moves at up to 0.05 m/s.
     slack = 0.05 * 0.001 * np.linalg.norm(wanted[:, :3], axis=1)
-    assert (np.abs(found[:, 3:] - wanted[:, 3:]).max(axis=1) <= 2.0 * slack + 1e-7).all()
+    assert (np.abs(wrenches[:, 3:] - wanted[:, 3:]).max(axis=1) <= 2.0 * slack + 1e-7).all()
 
 
 def test_two_arms_have_two_wrenches():

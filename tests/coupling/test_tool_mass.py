@@ -26,12 +26,12 @@ def test_a_balls_bound_is_that_of_its_cross_section():
     """k = k_p pi r^2, c = c_p pi r^2: m >= (k dt + c) dt / 2; stiffer friction counts where there is any."""
     area = np.pi * 0.01**2
     law = ELASTIC._replace(damping=500.0)
-    (found,) = tool_masses(free_ball(0.005, 0.01, 0.01), law, WIDE)
-    assert found.name == "ball"
-    assert found.mass == pytest.approx(0.005, rel=1e-12)
-    assert found.stiffness == pytest.approx(2e7 * area)
-    assert found.least_mass == pytest.approx(0.5 * DT * (2e7 * area * DT + 500.0 * area))
-    assert found.least_damping == 0.0
+    (tool,) = tool_masses(free_ball(0.005, 0.01, 0.01), law, WIDE)
+    assert tool.name == "ball"
+    assert tool.mass == pytest.approx(0.005, rel=1e-12)
+    assert tool.stiffness == pytest.approx(2e7 * area)
+    assert tool.least_mass == pytest.approx(0.5 * DT * (2e7 * area * DT + 500.0 * area))
+    assert tool.least_damping == 0.0
     sticky = law._replace(tangential_stiffness=5e7)
     assert tool_masses(free_ball(0.005, 0.01, 0.01), sticky, WIDE)[0].stiffness == pytest.approx(2e7 * area)
     sticky = sticky._replace(friction=0.1)
@@ -74,10 +74,10 @@ def test_a_tool_too_light_is_refused_and_the_ways_out_work():
         check_tool_masses("x", free_ball(0.99 * least, 0.01, 0.01, joint=UPRIGHT), ELASTIC, WIDE)
     check_tool_masses("x", free_ball(1.01 * least, 0.01, 0.01, joint=UPRIGHT), ELASTIC, WIDE)
     light = free_ball(0.3 * least, 0.01, 0.01, joint=UPRIGHT)
-    (found,) = tool_masses(light, ELASTIC, WIDE)
-    light.model.dof_damping[:] = 1.001 * found.least_damping
+    (tool,) = tool_masses(light, ELASTIC, WIDE)
+    light.model.dof_damping[:] = 1.001 * tool.least_damping
     check_tool_masses("x", light, ELASTIC, WIDE)
-    light.model.dof_damping[:] = 0.99 * found.least_damping
+    light.model.dof_damping[:] = 0.99 * tool.least_damping
     with pytest.raises(OrganError, match="'ball'"):
         check_tool_masses("x", light, ELASTIC, WIDE)
 
@@ -86,9 +86,9 @@ def test_a_tool_too_light_is_refused_and_the_ways_out_work():
 def test_shipped_scenes_pass_with_room(name: str):
     simulation = Simulation(load_anatomy(make_scene(name)))
     area = float(simulation.organ_model.surface_rest_area.sum())
-    (found,) = tool_masses(simulation.instrument, simulation.contact, area)
-    assert found.mass == pytest.approx(0.08, rel=1e-9)  # the z slide and the tip
-    assert found.mass > 2.0 * found.least_mass
+    (tool,) = tool_masses(simulation.instrument, simulation.contact, area)
+    assert tool.mass == pytest.approx(0.08, rel=1e-9)  # the z slide and the tip
+    assert tool.mass > 2.0 * tool.least_mass
 
 
 def test_a_scene_whose_contact_is_too_stiff_for_its_tool_is_refused():
@@ -108,7 +108,7 @@ DEPTH = 0.0025  # [m] of an 8 mm ball: the guard of its centre (beyond 0.4 r) is
 
 
 def thrown(mass: float, *, substeps: int = 4, damping: float = 0.0) -> bool:
-    """Whether a ball at rest DEPTH deep in a block that does not move, knocked at 2 mm/s, ends faster than 50."""
+    """True if a ball at rest DEPTH deep in a fixed block, knocked at 2 mm/s, diverges or ends faster than 50."""
     coupled = resting(mass, DEPTH, ELASTIC, joint=UPRIGHT, substeps=substeps)
     coupled.ball.model.dof_damping[:] = damping
     coupled.ball.data.qvel[0] = 2e-3
@@ -134,8 +134,8 @@ def test_the_bound_counts_more_than_is_felt():
     """
     felt = felt_stiffness()
     assert felt == pytest.approx(0.5 * 2e7 * np.pi * 0.008**2 * (1.0 - (1.0 - DEPTH / 0.008) ** 4), rel=0.05)
-    (found,) = tool_masses(free_ball(0.1, 0.008, 0.0), ELASTIC, WIDE)
-    assert 2.0 * felt < found.stiffness < 3.0 * felt
+    (tool,) = tool_masses(free_ball(0.1, 0.008, 0.0), ELASTIC, WIDE)
+    assert 2.0 * felt < tool.stiffness < 3.0 * felt
 
 
 def test_no_press_is_felt_stiffer_than_the_bound():
@@ -178,8 +178,8 @@ def test_a_tool_below_the_bound_is_thrown_off_and_one_above_stays(substeps: int,
 def test_one_substep_needs_more_mass():
     """The pressure after the whole step at the old twist: m >= (1.5 k dt + c) dt / 2."""
     law = ELASTIC._replace(damping=500.0)
-    one, two = (tool_masses(free_ball(0.005, 0.01, 0.01), law, WIDE, count)[0] for count in (1, 2))
-    assert one.least_mass - two.least_mass == pytest.approx(0.25 * two.stiffness * DT**2)
+    single, double = (tool_masses(free_ball(0.005, 0.01, 0.01), law, WIDE, count)[0] for count in (1, 2))
+    assert single.least_mass - double.least_mass == pytest.approx(0.25 * double.stiffness * DT**2)
 
 
 def test_damping_holds_a_tool_below_the_bound():

@@ -17,7 +17,7 @@ class Now:
         self.observation = np.zeros(env.observation_space.shape, dtype=np.float32)
 
     def __getitem__(self, channel: str) -> np.ndarray:
-        """What a channel shows now, in SI units."""
+        """A channel's value now, in SI units."""
         return self.env.si_values(self.observation)[self.env.observation_slices[channel]]
 
 
@@ -47,8 +47,8 @@ def play(
     if gym.spec(env_id).vector_entry_point:
         envs = make_envs(env_id, lanes, dtype="float64", **settings)
     else:
-        one = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": "Disabled"}}
-        envs = gym.make_vec(env_id, 1, **one, **settings)
+        arguments = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": "Disabled"}}
+        envs = gym.make_vec(env_id, 1, **arguments, **settings)
     episodes = [(name, seed) for seed in seeds for name in strategies]
     players = iter([Player(strategies[name]) for name, _ in episodes])
     actor = AgentActor(lambda: next(players), facts=lambda env: env)

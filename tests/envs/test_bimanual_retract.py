@@ -40,17 +40,17 @@ class Told:
         monkeypatch.setattr(self.task, "_from_target", lambda _: np.array([self.place, 0.0, 0.0]))
         monkeypatch.setattr(Pair, "collision_force", property(lambda _: self.collision))
 
-    def _tell(self, told):
-        """What is felt from now on: all as success asks, but for what is told."""
+    def _tell(self, changes):
+        """Values felt from now on: all as success asks, but for the changes."""
         usual = {"holds": True, "place": 0.0, "uncovered": 1.0, "force": 0.5, "collision": 0.0}
-        for name, value in {**usual, **told}.items():
+        for name, value in {**usual, **changes}.items():
             setattr(self, name, value)
 
     def _feel(self, _):
         self.task.uncovered_share, self.task.touch_force = self.uncovered, self.force
 
-    def step(self, count=1, force_peak=0.0, fault="", **told):
-        self._tell(told)
+    def step(self, count=1, force_peak=0.0, fault="", **changes):
+        self._tell(changes)
         for _ in range(count):
             self.task.step_count += 1
             self._feel(None)
@@ -63,26 +63,26 @@ class Told:
 
 
 @pytest.fixture
-def told(env, monkeypatch):
+def episode(env, monkeypatch):
     return Told(env, monkeypatch)
 
 
-def test_success_is_a_gentle_touch_of_the_exposed_target_for_half_a_second(told):
-    assert not told.step(9).terminated
-    verdict = told.step()
+def test_success_is_a_gentle_touch_of_the_exposed_target_for_half_a_second(episode):
+    assert not episode.step(9).terminated
+    verdict = episode.step()
     assert verdict.terminated and verdict.info["success"] and verdict.rewards["success"] == 10.0
 
 
 @pytest.mark.parametrize(
     "missing", [{"holds": False}, {"uncovered": 0.79}, {"force": 0.29}, {"force": 1.01}, {"place": 0.0081}]
 )
-def test_nothing_of_it_may_be_missing(told, missing):
+def test_nothing_of_it_may_be_missing(episode, missing):
     """Neither all the time nor in one step of ten."""
-    assert not told.step(20, **missing).info["success"]
-    told.step(9)
-    assert not told.step(**missing).terminated
-    assert not told.step(9).terminated
-    assert told.step().info["success"]
+    assert not episode.step(20, **missing).info["success"]
+    episode.step(9)
+    assert not episode.step(**missing).terminated
+    assert not episode.step(9).terminated
+    assert episode.step().info["success"]
 
 
 @pytest.mark.parametrize(
@@ -94,9 +94,9 @@ def test_nothing_of_it_may_be_missing(told, missing):
         ({"fault": "told so"}, None),
     ],
 )
-def test_harm_ends_it_and_is_named(told, harm, key):
-    told.step(9)
-    verdict = told.step(**harm)
+def test_harm_ends_it_and_is_named(episode, harm, key):
+    episode.step(9)
+    verdict = episode.step(**harm)
     assert verdict.terminated and not verdict.info["success"]
     assert key is None or verdict.info[key]
 
@@ -112,19 +112,19 @@ def test_the_weights_put_every_failure_below_every_full_episode():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("harm", [{"collision": 9.0}, {"force": 9.0}, {"force_peak": 9.0}, {"fault": "told so"}])
-def test_no_failed_episode_returns_more_than_the_worst_full_one(told, harm):
+def test_no_failed_episode_returns_more_than_the_worst_full_one(episode, harm):
     start = {"visible": HIDDEN_SHARE, "grasped": 0.0, "near": 1.0, "touched": 0.0}
-    told.runtime._reached = dict(start)
+    episode.runtime._reached = dict(start)
     lost = {"holds": False, "uncovered": 0.0, "place": 1.0, "force": 0.0}
-    assert told.step(EPISODE_STEPS, force_peak=told.runtime.force_limit, **lost).truncated
-    worst, told.returned = told.returned, 0.0
+    assert episode.step(EPISODE_STEPS, force_peak=episode.runtime.force_limit, **lost).truncated
+    worst, episode.returned = episode.returned, 0.0
     for steps in (1, 5, 300, 600):
-        told.runtime.draw(np.random.default_rng(0))
-        told.runtime._reached, told.returned = dict.fromkeys(start, 0.0), 0.0
+        episode.runtime.draw(np.random.default_rng(0))
+        episode.runtime._reached, episode.returned = dict.fromkeys(start, 0.0), 0.0
         for step in range(steps - 1):
-            told.step(force=0.0 if step % 9 == 8 else 0.5)
-        assert told.step(**harm).terminated
-        assert told.returned < worst
+            episode.step(force=0.0 if step % 9 == 8 else 0.5)
+        assert episode.step(**harm).terminated
+        assert episode.returned < worst
 
 
 def test_both_arms_go_as_told_and_only_the_left_jaw_closes(env):

@@ -93,9 +93,9 @@ def made(request):
 
 def assert_same(first, second):
     assert len(first) == len(second)
-    for one, other in zip(first, second, strict=True):
-        assert one[0].tobytes() == other[0].tobytes()
-        assert one[1:] == other[1:]
+    for record, other in zip(first, second, strict=True):
+        assert record[0].tobytes() == other[0].tobytes()
+        assert record[1:] == other[1:]
 
 
 def test_there_are_ids():
@@ -141,19 +141,19 @@ def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(m
     saved = env.save_state()
     actions = np.random.default_rng(1).uniform(-0.4, 0.4, (10 // shorter, *env.action_space.shape)).astype(np.float32)
 
-    def go_on(one):
-        return [one.step(action) for action in actions]
+    def go_on(environment):
+        return [environment.step(action) for action in actions]
 
     expected = go_on(env)
     next_start = env.reset()
     other = made().unwrapped
     other.reset(seed=99)
-    for one in (env, other):
-        one.load_state(saved)
-        assert one.save_state() == saved
-        assert_same(expected, go_on(one))
+    for environment in (env, other):
+        environment.load_state(saved)
+        assert environment.save_state() == saved
+        assert_same(expected, go_on(environment))
         # The random generator went on as well: the next episode is the same too.
-        assert_same([next_start], [one.reset()])
+        assert_same([next_start], [environment.reset()])
 
 
 def test_foreign_or_broken_states_are_refused(made, tmp_path):
@@ -171,7 +171,7 @@ def test_foreign_or_broken_states_are_refused(made, tmp_path):
         text = text.replace("../meshes", str(scenes_folder() / "meshes"))
         (tmp_path / file).write_text(text.replace(cells, fewer), "utf-8")
     other = made(scene=str(tmp_path / f"{name}.toml")).unwrapped
-    counts = [one.simulation.anatomy.mesh.node_count for one in (env, other)]
+    counts = [environment.simulation.anatomy.mesh.node_count for environment in (env, other)]
     with pytest.raises(
         ValueError, match=rf"saved by .*{counts[0]} nodes.*, this is .*{counts[1]} nodes.* use the same scene"
     ):
@@ -221,7 +221,7 @@ def test_channels_make_up_the_observation_in_their_order(made):
         tip = env.simulation.instrument.tip_position.astype(np.float32)
         np.testing.assert_array_equal(env.task_observation[slices["tip_position"]], tip)
         np.testing.assert_allclose(env.si_values(observation)[slices["tip_position"]], tip, atol=1e-7)
-    assert [key for key in info if key.startswith("reward_")] == [f"reward_{one.name}" for one in task.rewards]
+    assert [key for key in info if key.startswith("reward_")] == [f"reward_{reward.name}" for reward in task.rewards]
 
 
 def test_scaled_observations_are_of_order_one_and_hold_what_si_units_do(made):
@@ -229,12 +229,12 @@ def test_scaled_observations_are_of_order_one_and_hold_what_si_units_do(made):
     steps = 12 // SHORTER.get(scaled.spec.id, 1)
     first, second = rollout(scaled, seed=3, steps=steps), rollout(plain, seed=3, steps=steps)
     inner = scaled.unwrapped
-    for one, other in zip(first, second, strict=True):
+    for record, other in zip(first, second, strict=True):
         # To the rounding of single precision, of the value or of what it was less.
-        back, rounding = inner.si_values(one[0]), 3e-7 * (np.abs(inner._origin) + inner._scale)
+        back, rounding = inner.si_values(record[0]), 3e-7 * (np.abs(inner._origin) + inner._scale)
         assert (np.abs(back - other[0]) <= rounding + 3e-7 * np.abs(other[0])).all()
-        assert one[1:] == other[1:]
-        assert np.abs(one[0]).max() < 40.0
+        assert record[1:] == other[1:]
+        assert np.abs(record[0]).max() < 40.0
     assert inner.save_state() == plain.unwrapped.save_state()
 
 
@@ -251,12 +251,12 @@ def test_without_force_the_felt_channels_are_zero_and_all_else_is_the_same(made)
     assert felt
     steps = 12 // SHORTER.get(seeing.spec.id, 1)
     first, second = rollout(seeing, seed=3, steps=steps), rollout(blind, seed=3, steps=steps)
-    assert any(np.any(one[0][felt]) for one in first)
-    for one, other in zip(first, second, strict=True):
-        expected = one[0].copy()
+    assert any(np.any(record[0][felt]) for record in first)
+    for record, other in zip(first, second, strict=True):
+        expected = record[0].copy()
         expected[felt] = 0.0
         np.testing.assert_array_equal(other[0], expected)
-        assert one[1:] == other[1:]
+        assert record[1:] == other[1:]
     assert seeing.unwrapped.save_state() == blind.unwrapped.save_state()
 
 
@@ -271,8 +271,8 @@ def test_lanes_give_what_single_environments_give(made):
     for envs in (lanes, singles):
         envs.reset(seed=[5, 6])
     for action in actions:
-        for one, other in zip(lanes.step(action)[:4], singles.step(action)[:4], strict=True):
-            np.testing.assert_array_equal(one, other)
+        for part, other in zip(lanes.step(action)[:4], singles.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(part, other)
     lanes.close()
 
 

@@ -57,7 +57,7 @@ def far(now: Now, channel: str, place: ArrayLike, tolerance: float = 0.001) -> b
 
 
 def edge(now: Now) -> tuple[float, float, float]:
-    """Where the left jaw grasps the free edge [m]: x beside the target, the edge's y there, the middle's z."""
+    """The left jaw's place on the free edge [m]: x beside the target, the edge's y there, the middle's z."""
     points, x = now["edge_points"].reshape(-1, 3), float(now["target_place"][0]) + BESIDE
     y, top = (float(np.interp(x, points[:, 0], points[:, axis])) for axis in (1, 2))
     return x, y, top - HALF_THICKNESS
@@ -217,8 +217,8 @@ def tear(now: Now) -> Iterator[np.ndarray]:
 
 
 DEGENERATE = {
-    one.__name__: one
-    for one in (
+    strategy.__name__: strategy
+    for strategy in (
         stand_still,
         leave,
         ram,
@@ -257,7 +257,7 @@ def test_no_degenerate_strategy_is_paid_like_a_plain_script():
     """About five minutes of processor time."""
     seeds = range(2)
     honest = mean_return(play(ID, {"script": script}, seeds)["script"])
-    assert honest > sum(one.weight for one in BimanualRetractTask.rewards if one.per == "change")
+    assert honest > sum(reward.weight for reward in BimanualRetractTask.rewards if reward.per == "change")
     for name, records in play(ID, DEGENERATE, seeds, max_episode_steps=STEPS).items():
         assert not any(record.last["success"] for record in records), name
         assert mean_return(records) < honest, name

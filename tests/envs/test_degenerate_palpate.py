@@ -126,8 +126,8 @@ def farm_found(now: Now) -> Iterator[np.ndarray]:
 
 
 DEGENERATE = {
-    one.__name__: one
-    for one in (
+    strategy.__name__: strategy
+    for strategy in (
         stand_still,
         leave,
         hover,
@@ -174,7 +174,7 @@ def hold_force(now: Now, force: float) -> Iterator[np.ndarray]:
 
 def test_only_a_declaration_pays():
     """So that an episode without one returns at most 0, whatever is done in it."""
-    assert [one.name for one in PalpateTask.rewards if one.weight > 0.0] == ["found"]
+    assert [reward.name for reward in PalpateTask.rewards if reward.weight > 0.0] == ["found"]
 
 
 SCENE, SEEDS = "phantom_small", range(8)
@@ -187,7 +187,7 @@ def honest():
 
 def test_a_plain_search_is_paid_more_than_early_declarations_and_than_none(honest):
     assert honest > 0.0
-    early = {one.__name__: one for one in (declare_at_once, declare_in_the_middle)}
+    early = {strategy.__name__: strategy for strategy in (declare_at_once, declare_in_the_middle)}
     for name, records in play(ID, early, SEEDS, scene=SCENE).items():
         assert all(record.last["declared"] for record in records), name
         assert mean_return(records) < honest, name

@@ -140,8 +140,8 @@ def begin_late(now: Now) -> Iterator[np.ndarray]:
 
 
 DEGENERATE = {
-    one.__name__: one
-    for one in (
+    strategy.__name__: strategy
+    for strategy in (
         stand_still,
         leave,
         ram_the_edge,
@@ -197,7 +197,7 @@ def test_no_degenerate_strategy_is_paid_like_a_plain_script():
     seeds = range(2)
     honest = mean_return(play(ID, {"script": script}, seeds)["script"])
     late = {"begin_late": begin_late}
-    others = {name: one for name, one in DEGENERATE.items() if name not in late}
+    others = {name: strategy for name, strategy in DEGENERATE.items() if name not in late}
     assert honest > reward_weights(RetractTask)["visible"] + reward_weights(RetractTask)["grasped"]
     paid = play(ID, others, seeds, max_episode_steps=STEPS) | play(ID, late, seeds[:1])
     for name, records in paid.items():

@@ -76,7 +76,7 @@ def guess_late(now: Now) -> Iterator[np.ndarray]:
 
 
 def saturate(now: Now) -> Iterator[np.ndarray]:
-    """Where the healthy organ is stiffest, which gives the largest force that a press can have."""
+    """The stiffest site of the healthy organ, for the largest force that a press can have."""
     charted = now.task.charted
     stiffness = [now.task.felt.healthy.stiffness(place) for place in charted.chart.sites]
     while True:
@@ -90,7 +90,7 @@ def stay_at_the_stiffest(now: Now) -> Iterator[np.ndarray]:
         yield place
         felt.append((float(now["last_contrast"][0]), now["last_place"]))
     while True:
-        yield max(felt, key=lambda one: one[0])[1]
+        yield max(felt, key=lambda press: press[0])[1]
 
 
 def farm_found(now: Now) -> Iterator[np.ndarray]:
@@ -112,8 +112,8 @@ def press_healthy_tissue(now: Now) -> Iterator[np.ndarray]:
 
 
 DEGENERATE = {
-    one.__name__: one
-    for one in (
+    strategy.__name__: strategy
+    for strategy in (
         stay_in_the_middle,
         leave,
         follow_the_border,
@@ -137,7 +137,7 @@ SCENE = "phantom_small"
 
 def test_the_best_paid_of_them_are_paid_less_than_a_raster():
     """On few presses."""
-    best = {one.__name__: one for one in (follow_the_border, stay_at_the_stiffest, farm_found)}
+    best = {strategy.__name__: strategy for strategy in (follow_the_border, stay_at_the_stiffest, farm_found)}
     paid = play(ID, {"raster": raster, **best}, range(6), scene=SCENE, budget=SIDE**2)
     honest = mean_return(paid.pop("raster"))
     for name, records in paid.items():

@@ -112,16 +112,16 @@ def test_side_by_side_equals_one_after_the_other(blocks, env_id, settings):
     rng, names = np.random.default_rng(0), set()
     for step in range(5 if env_id == SITES else 12):
         moves = actions(env_id, count, rng)
-        found, expected = together.step(moves), apart.step(moves)
-        assert_equal(found[:4], expected[:4])
-        assert_equal(found[4], expected[4])
+        result, expected = together.step(moves), apart.step(moves)
+        assert_equal(result[:4], expected[:4])
+        assert_equal(result[4], expected[4])
         singles = [env.unwrapped for env in together.envs]  # type: ignore[attr-defined]
-        names.add(tuple(str(one.task.anatomy.member) for one in singles))
+        names.add(tuple(str(single.task.anatomy.member) for single in singles))
         if step == 6:
             assert_equal(together.reset(seed=[7, 8, 9]), apart.reset(seed=[7, 8, 9]))
     assert len(names) > 1 and any(len(set(beside)) > 1 for beside in names), "other members come into the lanes"
-    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
-        assert one.unwrapped.save_state() == other.unwrapped.save_state()
+    for env, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
+        assert env.unwrapped.save_state() == other.unwrapped.save_state()
     together.close()
     apart.close()
 
@@ -143,8 +143,8 @@ def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(bloc
     monkeypatch.setattr(member_chart, "healthy_map_of", lambda anatomy: chart.HealthyMap(np.full((13, 13), 50.0)))
     template = load_anatomy(load_scene(Path(blocks)))
     for number in (0, 1, 0):
-        found = member_chart.member_map(template, MemberName("test", number))
-        np.testing.assert_allclose(found.grid, 100.0, rtol=1e-12)
+        healthy = member_chart.member_map(template, MemberName("test", number))
+        np.testing.assert_allclose(healthy.grid, 100.0, rtol=1e-12)
     count = member_chart.PRESS_COUNT
     assert pressed == [("test 0", count, "test 0"), ("test 1", count, "test 1")]
     assert len(list((tmp_path / "cache").iterdir())) == 2

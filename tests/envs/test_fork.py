@@ -15,7 +15,7 @@ PATIENCE = 60.0
 
 
 def in_a_fork(function):
-    """What a function returns in a forked child, or the exception that it raises there."""
+    """A function's result in a forked child, or the exception that it raises there."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
 

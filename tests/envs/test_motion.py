@@ -65,7 +65,7 @@ def test_cycles_rise_fall_and_rest():
             assert abs(signal_at(drive, number, begin + (motion.rise + motion.fall) * length)) < 1e-9
             assert signal_at(drive, number, begin + 0.99 * length) == pytest.approx(0.0, abs=1e-12)
         time = np.arange(0.0, 3.0, 1e-4)
-        speed = np.diff([signal_at(drive, number, one) for one in time]) / 1e-4
+        speed = np.diff([signal_at(drive, number, moment) for moment in time]) / 1e-4
         # The largest acceleration: |p''| is at most 10 / sqrt(3).
         bend = size.max() * 10.0 / (np.sqrt(3.0) * (min(motion.rise, motion.fall) * lengths.min()) ** 2)
         assert np.abs(np.diff(speed)).max() < 1.05 * bend * 1e-4
@@ -81,7 +81,7 @@ def test_the_ground_is_where_the_signals_say_after_each_haptic_step(scene):
     for _ in range(900):
         assert simulation.haptic_step()
         signals = [signal_at(simulation.drive, number, simulation.time) for number in range(2)]
-        shift = sum(s * one.shift(at_rest) for s, one in zip(signals, anatomy.ground_motions, strict=True))
+        shift = sum(s * motion.shift(at_rest) for s, motion in zip(signals, anatomy.ground_motions, strict=True))
         np.testing.assert_allclose(simulation.organ_state.node_position[anatomy.anchors], at_rest + shift, atol=1e-12)
         farthest = max(farthest, float(np.abs(shift).max()))
     assert farthest > 0.003
@@ -166,8 +166,8 @@ def test_a_state_saved_in_a_held_breath_goes_on_to_the_bit(anatomy):
         assert course(other, 600, {400: False}).tobytes() == expected.tobytes()
         assert other.organ_state.node_position.tobytes() == node_position.tobytes()
         # Letting go began a cycle at once; a restart goes back to what was drawn.
-        for one in (simulation, other):
-            one.restart(one.instrument.parked)
+        for twin in (simulation, other):
+            twin.restart(twin.instrument.parked)
         assert course(other, 300).tobytes() == course(simulation, 300).tobytes()
         assert other.organ_state.motion[0, SIGNAL] > 0.1
 
@@ -292,7 +292,7 @@ def test_a_tracked_step_goes_with_the_surface(scene_file):
 
 
 def test_a_target_lies_on_its_bed_that_moves():
-    """What the endoscope looks for, and what pictures show, goes with the bed; observed is its place at rest."""
+    """The target that the endoscope and pictures show goes with the bed; observed is its place at rest."""
     env = gym.make("SurgSim/Retract-v0", motion="free", scaled=False).unwrapped
     env.reset(seed=2)
     place = env.task.target.centre.copy()

@@ -62,7 +62,7 @@ def registered():
 def test_one_more_channel_and_reward_in_a_shipped_task_are_one_place(registered):
     """Bounds, slices, documentation, info and lanes follow, and what was there stays where it was."""
     id = registered(PalpateSlowly)
-    env, plain = (gym.make(one, scene="phantom_small") for one in (id, "SurgSim/Palpate-v0"))
+    env, plain = (gym.make(env_id, scene="phantom_small") for env_id in (id, "SurgSim/Palpate-v0"))
     inner = env.unwrapped
     slices = inner.observation_slices
     assert slices == {**plain.unwrapped.observation_slices, "height": slice(10, 12)}
@@ -121,10 +121,10 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
     env.reset(seed=9)
     env.load_state(saved)
     assert env.save_state() == saved and (env.task.place == kept).all() and env.task.steps == [1, 0.5]
-    for one in expected:
+    for record in expected:
         observation, *rest = env.step(down)
-        np.testing.assert_array_equal(observation, one[0])
-        assert rest == list(one[1:])
+        np.testing.assert_array_equal(observation, record[0])
+        assert rest == list(record[1:])
     with pytest.raises(ValueError, match="no oracle is known for GentleEnv"):
         oracle_script(env)
 

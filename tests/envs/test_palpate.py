@@ -154,8 +154,8 @@ def test_a_fault_ends_the_episode_with_a_finite_observation_and_a_clean_reset(en
     np.testing.assert_array_equal(observation, before)
     assert reward == pytest.approx(-5.0 - 0.005 - 0.015 * (EPISODE_STEPS - 3) + info["reward_soft_force"])
     np.testing.assert_array_equal(env.reset(seed=6)[0], expected)
-    for one in reference:
-        assert act(env, (0.0, 0.0, -SPEED))[0].tobytes() == one.tobytes()
+    for observation in reference:
+        assert act(env, (0.0, 0.0, -SPEED))[0].tobytes() == observation.tobytes()
 
 
 def test_force_reading_is_noisy_biased_and_flags_saturation(env):

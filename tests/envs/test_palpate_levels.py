@@ -18,8 +18,8 @@ def test_there_is_one_lesion_whatever_the_level(level: str):
         env.reset(seed=seed)
         drawn.append(env.task.drawn)
         assert len(env.task.lesions) == 1 and env.task.lesion is env.task.lesions[0]
-    assert len({one.background for one in drawn}) == 8
-    assert any(one.capsule_stiffness > 0.0 for one in drawn) == (level != "easy")
+    assert len({draw.background for draw in drawn}) == 8
+    assert any(draw.capsule_stiffness > 0.0 for draw in drawn) == (level != "easy")
 
 
 def test_without_a_level_the_scene_is_as_it_is():

@@ -67,7 +67,7 @@ def test_the_stiffest_place_is_where_most_was_felt():
 
 
 def test_the_stiffest_place_follows_each_reading():
-    """What is kept of it between readings is that of the readings so far, also in a restored memory."""
+    """The place kept between readings is that of the readings so far, also in a restored memory."""
     env = gym.make(ID, memory=True).unwrapped
     env.reset(seed=3)
     memory, rng = env.task.memory, np.random.default_rng(0)

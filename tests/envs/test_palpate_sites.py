@@ -45,17 +45,17 @@ def test_a_press_feels_what_the_scan_feels():
     simulation = Simulation(small_anatomy())
     site = charted_face(simulation.anatomy).site([0.2, -0.3])
     simulation.reset(simulation.anatomy.organ(), simulation.instrument.parked)
-    found = press_alone(SitePress(simulation, site.point, site.normal), press_phases(simulation.anatomy.scene))
+    result = press_alone(SitePress(simulation, site.point, site.normal), press_phases(simulation.anatomy.scene))
     expected = press(simulation, site.point, site.normal)
-    assert not found.stopped and not found.fault and not expected.end
-    assert found.force @ site.normal == pytest.approx(expected.force, rel=2e-3)
-    assert found.depth == pytest.approx(expected.depth, rel=1e-3)
-    assert found.force_peak == pytest.approx(expected.force_peak, rel=1e-12)
-    assert found.duration == pytest.approx(expected.duration)
+    assert not result.stopped and not result.fault and not expected.end
+    assert result.force @ site.normal == pytest.approx(expected.force, rel=2e-3)
+    assert result.depth == pytest.approx(expected.depth, rel=1e-3)
+    assert result.force_peak == pytest.approx(expected.force_peak, rel=1e-12)
+    assert result.duration == pytest.approx(expected.duration)
 
 
 def test_the_organ_is_at_rest_again_before_the_next_press():
-    """What a press leaves when the tip has left at 20 mm/s for the nearest site: below 0.1 % of the press depth."""
+    """Displacement after a press and a move at 20 mm/s to the nearest site: below 0.1 % of the press depth."""
     simulation = Simulation(small_anatomy())
     scene = simulation.anatomy.scene
     simulation.reset(simulation.anatomy.organ(), simulation.instrument.parked)
@@ -78,14 +78,14 @@ def test_force_stops_a_press_before_the_hard_limit_does():
     simulation = Simulation(anatomy)
     simulation.reset(anatomy.organ(modulus_factor=4.0), simulation.instrument.parked)
     site = charted_face(anatomy).site(MIDDLE)
-    found = press_alone(SitePress(simulation, site.point, site.normal), press_phases(anatomy.scene))
+    result = press_alone(SitePress(simulation, site.point, site.normal), press_phases(anatomy.scene))
     limits = anatomy.scene.limits
-    assert found.stopped and not found.fault
-    assert stop_force(limits) < found.force_peak < limits.hard_force
-    assert found.depth < 0.9 * anatomy.scene.palpation.press_depth
+    assert result.stopped and not result.fault
+    assert stop_force(limits) < result.force_peak < limits.hard_force
+    assert result.depth < 0.9 * anatomy.scene.palpation.press_depth
     # Its stiffness still tells: not quite four times the healthy one, as it rises with depth and contact stays as soft.
     healthy = float(healthy_map(make_scene("phantom_small")).stiffness(MIDDLE))
-    assert 3.0 * healthy < found.force @ site.normal / found.depth < 4.0 * healthy
+    assert 3.0 * healthy < result.force @ site.normal / result.depth < 4.0 * healthy
 
 
 # ---- the chart ------------------------------------------------------------------------------------------------------
@@ -183,9 +183,9 @@ def test_without_memory_the_last_press_alone_is_observed():
     actions = raster(2)
     with_memory = play(gym.make(ID, **SMALL), 4, actions)
     without = play(gym.make(ID, memory=False, **SMALL), 4, actions)
-    for one, other in zip(with_memory, without, strict=True):
-        np.testing.assert_array_equal(one[0][-6:], other[0])
-        assert one[1:] == other[1:]
+    for record, other in zip(with_memory, without, strict=True):
+        np.testing.assert_array_equal(record[0][-6:], other[0])
+        assert record[1:] == other[1:]
 
 
 def test_what_is_found_pays_by_its_change():
@@ -242,6 +242,6 @@ def test_a_press_that_was_begun_is_forgotten_with_its_episode():
     for forget in (lambda: env.reset(seed=9), lambda: env.load_state(saved)):
         env.begin(np.ones(2))
         forget()
-        found = env.step(MIDDLE)
-        np.testing.assert_array_equal(found[0], expected[0])
-        assert found[1:] == expected[1:]
+        result = env.step(MIDDLE)
+        np.testing.assert_array_equal(result[0], expected[0])
+        assert result[1:] == expected[1:]

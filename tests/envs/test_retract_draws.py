@@ -14,19 +14,19 @@ def check_draws(env, seeds):
     drawn = []
     for seed in seeds:
         _, info = env.reset(seed=seed)
-        one = env.task.drawn
+        draw = env.task.drawn
         assert info["visible"] <= HIDDEN_SHARE
-        assert table.scale[0] <= one.scale <= table.scale[1]
-        assert table.youngs_modulus[0] <= one.youngs_modulus <= table.youngs_modulus[1]
-        assert np.linalg.norm(np.subtract(one.eye, endoscope.position)) <= 0.005
-        views = np.subtract(one.looks_at, one.eye), np.subtract(endoscope.target, endoscope.position)
+        assert table.scale[0] <= draw.scale <= table.scale[1]
+        assert table.youngs_modulus[0] <= draw.youngs_modulus <= table.youngs_modulus[1]
+        assert np.linalg.norm(np.subtract(draw.eye, endoscope.position)) <= 0.005
+        views = np.subtract(draw.looks_at, draw.eye), np.subtract(endoscope.target, endoscope.position)
         cosine = views[0] @ views[1] / np.linalg.norm(views[0]) / np.linalg.norm(views[1])
         assert math.degrees(math.acos(min(cosine, 1.0))) <= 5.0
-        assert 0.015 <= one.target[1] <= 0.030
+        assert 0.015 <= draw.target[1] <= 0.030
         points = env.simulation.organ_state.node_position
         top = points[env.task.tracked_nodes[:5]]
-        np.testing.assert_allclose(top[:, 1], 0.052 * one.scale, atol=0.002)
-        drawn.append(one)
+        np.testing.assert_allclose(top[:, 1], 0.052 * draw.scale, atol=0.002)
+        drawn.append(draw)
     return drawn
 
 
@@ -34,7 +34,7 @@ def check_draws(env, seeds):
 def test_draws_are_in_their_ranges_and_hide_the_target(shared_retract):
     drawn = check_draws(shared_retract, range(15))
     assert len(set(drawn)) == 15
-    capsules = [one.capsule_stiffness > 0.0 for one in drawn]
+    capsules = [draw.capsule_stiffness > 0.0 for draw in drawn]
     assert any(capsules) and not all(capsules)
 
 

@@ -34,7 +34,7 @@ class Told:
 
 
 @pytest.fixture
-def told(retract_env, monkeypatch):
+def episode(retract_env, monkeypatch):
     return Told(retract_env, monkeypatch)
 
 
@@ -53,66 +53,66 @@ def test_the_weights_put_every_failure_below_every_full_episode():
 FAILURES = {"torn": {"pull": 1e9}, "hard_force": {"force": 1e9}, "fault": {"fault": "told so"}}
 
 
-def worst_full_return(told):
+def worst_full_return(episode):
     """A full episode that presses as hard as it may all the time and loses at its end what was seen at its start."""
-    told.runtime._reached = {"visible": HIDDEN_SHARE, "grasped": 0.0}
+    episode.runtime._reached = {"visible": HIDDEN_SHARE, "grasped": 0.0}
     for _ in range(EPISODE_STEPS):
-        verdict = told.step(force=told.runtime.force_limit)
+        verdict = episode.step(force=episode.runtime.force_limit)
     assert verdict.truncated and not verdict.terminated
-    return told.returned
+    return episode.returned
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", FAILURES)
-def test_no_failed_episode_returns_more_than_the_worst_full_one(told, failure):
+def test_no_failed_episode_returns_more_than_the_worst_full_one(episode, failure):
     """The best way to fail: all seen but never for long, grasped, without pressing; then, sooner or later, harm."""
-    worst = worst_full_return(told)
+    worst = worst_full_return(episode)
     for step in (1, 2, 9, 100, 333, 599, 600):
-        told.runtime.draw(np.random.default_rng(0))
-        told.runtime._reached = {"visible": 0.0, "grasped": 0.0}
-        told.returned = 0.0
+        episode.runtime.draw(np.random.default_rng(0))
+        episode.runtime._reached = {"visible": 0.0, "grasped": 0.0}
+        episode.returned = 0.0
         for before in range(1, step):
             # Never for SUCCESS_TIME on end.
-            assert not told.step(visible=float(before % 10 > 0), holds=True).terminated
-        verdict = told.step(visible=1.0, holds=True, **FAILURES[failure])
+            assert not episode.step(visible=float(before % 10 > 0), holds=True).terminated
+        verdict = episode.step(visible=1.0, holds=True, **FAILURES[failure])
         assert verdict.terminated and verdict.rewards[failure] == WEIGHTS[failure]
-        assert told.returned < worst
+        assert episode.returned < worst
 
 
-def test_seen_and_grasped_pay_once_however_often_they_come_and_go(told):
+def test_seen_and_grasped_pay_once_however_often_they_come_and_go(episode):
     for _ in range(40):
-        told.step(visible=0.7, holds=True)
-        told.step(visible=0.1, holds=False)
-    assert told.returned == pytest.approx(80 * WEIGHTS["time"] + 0.1 * WEIGHTS["visible"])
-    told.step(visible=0.7, holds=True)
-    assert told.verdict.rewards["visible"] == pytest.approx(0.6 * WEIGHTS["visible"])
-    assert told.verdict.rewards["grasped"] == WEIGHTS["grasped"]
+        episode.step(visible=0.7, holds=True)
+        episode.step(visible=0.1, holds=False)
+    assert episode.returned == pytest.approx(80 * WEIGHTS["time"] + 0.1 * WEIGHTS["visible"])
+    episode.step(visible=0.7, holds=True)
+    assert episode.verdict.rewards["visible"] == pytest.approx(0.6 * WEIGHTS["visible"])
+    assert episode.verdict.rewards["grasped"] == WEIGHTS["grasped"]
 
 
-def test_success_is_a_half_second_on_end(told):
+def test_success_is_a_half_second_on_end(episode):
     for _ in range(9):
-        assert not told.step(visible=SUCCESS_SHARE).terminated
-    assert not told.step(visible=SUCCESS_SHARE - 1e-6).terminated
+        assert not episode.step(visible=SUCCESS_SHARE).terminated
+    assert not episode.step(visible=SUCCESS_SHARE - 1e-6).terminated
     for _ in range(9):
-        assert not told.step(visible=1.0).terminated
-    verdict = told.step(visible=1.0)
+        assert not episode.step(visible=1.0).terminated
+    verdict = episode.step(visible=1.0)
     assert verdict.terminated and verdict.info["success"] and verdict.rewards["success"] == 10.0
     assert verdict.rewards["forgone"] == 0.0
     assert (SUCCESS_SHARE, HIDDEN_SHARE) == (0.8, 0.1)
 
 
-def test_soft_force_costs_by_its_share_of_the_way_to_the_hard_limit(told):
-    limits = told.task.limits
+def test_soft_force_costs_by_its_share_of_the_way_to_the_hard_limit(episode):
+    limits = episode.task.limits
     middle = 0.5 * (limits.soft_force + limits.hard_force)
     for force, share in ((limits.soft_force, 0.0), (middle, 0.5), (limits.hard_force, 1.0)):
-        assert told.step(force=force).rewards["soft_force"] == pytest.approx(share * WEIGHTS["soft_force"])
+        assert episode.step(force=force).rewards["soft_force"] == pytest.approx(share * WEIGHTS["soft_force"])
 
 
-def test_time_runs_out_after_600_steps(told):
+def test_time_runs_out_after_600_steps(episode):
     for step in range(1, EPISODE_STEPS + 1):
-        verdict = told.step()
+        verdict = episode.step()
         assert verdict.truncated == (step == EPISODE_STEPS)
-    assert told.returned == pytest.approx(EPISODE_STEPS * WEIGHTS["time"], abs=0.5)
+    assert episode.returned == pytest.approx(EPISODE_STEPS * WEIGHTS["time"], abs=0.5)
 
 
 # ---- what ends it -----------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ def one_after_the_other(mode: str, **settings) -> gym.vector.VectorEnv:
 
 
 def goals(envs: gym.vector.VectorEnv) -> np.ndarray:
-    """Where each jaw grasps: over the target, deep enough over the edge [m] (n_env, 3)."""
+    """Each jaw's goal: over the target, deep enough over the edge [m] (n_env, 3)."""
     targets = np.array([env.unwrapped.task.target.centre for env in envs.envs])  # type: ignore[attr-defined]
     return np.column_stack([targets[:, 0], np.full(len(targets), 0.048), np.full(len(targets), 0.005)])
 
@@ -60,17 +60,17 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str | No
     observation, goal = first[0], goals(together)
     size, held, ends = together.single_action_space.shape[0], 0, 0  # type: ignore[index]
     for step in range(steps):
-        told = action(observation, goal, grasp=step >= closes, size=size)
-        found, expected = together.step(told), apart.step(told)
-        assert_equal(found[:4], expected[:4])
-        assert_equal(found[4], expected[4])
-        observation = found[0]
-        held += int(found[4]["holds"].sum()) if "holds" in found[4] else 0
-        ends += int((found[2] | found[3]).sum())
+        moves = action(observation, goal, grasp=step >= closes, size=size)
+        result, expected = together.step(moves), apart.step(moves)
+        assert_equal(result[:4], expected[:4])
+        assert_equal(result[4], expected[4])
+        observation = result[0]
+        held += int(result[4]["holds"].sum()) if "holds" in result[4] else 0
+        ends += int((result[2] | result[3]).sum())
     assert ends >= COUNT
     assert held > 0 or instrument is not None, "the grasper grasps"
-    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
-        assert one.unwrapped.save_state() == other.unwrapped.save_state()  # type: ignore[attr-defined]
+    for env, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
+        assert env.unwrapped.save_state() == other.unwrapped.save_state()  # type: ignore[attr-defined]
     models = [env.unwrapped.simulation.organ_model for env in together.envs]  # type: ignore[attr-defined]
     assert len({float(model.node_rest_position.max()) for model in models}) == COUNT, "sizes differ"
     together.close()
@@ -82,8 +82,8 @@ def test_lobes_on_moving_ground_equal_environments_one_after_the_other():
     together, apart = side_by_side(motion="calm"), one_after_the_other("NextStep", motion="calm")
     assert_equal(together.reset(seed=SEED), apart.reset(seed=SEED))
     for _ in range(3):
-        told = np.full(together.action_space.shape, -0.3, dtype=np.float32)  # type: ignore[arg-type]
-        assert_equal(together.step(told), apart.step(told))
+        moves = np.full(together.action_space.shape, -0.3, dtype=np.float32)  # type: ignore[arg-type]
+        assert_equal(together.step(moves), apart.step(moves))
     models = [env.unwrapped.simulation.organ_model for env in together.envs]  # type: ignore[attr-defined]
     assert len({len(model.motion_anchored_nodes) for model in models}) > 1, "held on different shares of their edge"
     together.close()

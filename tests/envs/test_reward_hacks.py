@@ -26,7 +26,7 @@ TABLES = {
         "weights": reward_weights(task),
         "steps": steps,
         "shared": task is PalpateSitesTask,
-        **{per: tuple(one.name for one in task.rewards if one.per == per) for per in PERIODS},
+        **{per: tuple(reward.name for reward in task.rewards if reward.per == per) for per in PERIODS},
     }
     for task, steps in (
         (PalpateTask, EPISODE_STEPS),
@@ -41,7 +41,7 @@ SEED = 1
 
 
 def of_a_step(table, *terms):
-    """What terms pay in one step at most."""
+    """The largest pay of terms in a step."""
     return sum(table["weights"][term] for term in terms) / (table["steps"] if table["shared"] else 1)
 
 

@@ -99,9 +99,9 @@ def test_a_press_that_was_begun_outlives_a_refusal():
     with pytest.raises(ValueError, match="not a saved state"):
         env.load_state(b"")
     env.advance([env])
-    found, expected = env.finish(), other.step(action)
-    np.testing.assert_array_equal(found[0], expected[0])
-    assert found[1:] == expected[1:]
+    result, expected = env.finish(), other.step(action)
+    np.testing.assert_array_equal(result[0], expected[0])
+    assert result[1:] == expected[1:]
 
 
 def test_the_state_of_a_fault_is_loaded_although_it_is_not_finite():

@@ -17,9 +17,9 @@ RNG = np.random.default_rng(0)
 
 
 def readings(sensor: ForceSensor, forces: list[float]) -> list[float]:
-    one = ForceReading(sensor)
-    one.reset(RNG)
-    return [float(one.read(np.array([0.0, 0.0, force]), RNG, 0.0)[0][2]) for force in forces]
+    reading = ForceReading(sensor)
+    reading.reset(RNG)
+    return [float(reading.read(np.array([0.0, 0.0, force]), RNG, 0.0)[0][2]) for force in forces]
 
 
 def test_hysteresis_is_a_loop_of_twice_its_value():
@@ -32,19 +32,19 @@ def test_hysteresis_is_a_loop_of_twice_its_value():
 
 
 def test_drift_is_drawn_once_and_grows_with_time():
-    one = ForceReading(replace(QUIET, drift=0.001))
-    one.reset(np.random.default_rng(1))
-    assert (np.abs(one.drift) <= 0.001).all() and np.ptp(one.drift) > 0.0
+    reading = ForceReading(replace(QUIET, drift=0.001))
+    reading.reset(np.random.default_rng(1))
+    assert (np.abs(reading.drift) <= 0.001).all() and np.ptp(reading.drift) > 0.0
     for time in (0.0, 10.0, 40.0):
-        np.testing.assert_allclose(one.read(np.zeros(3), RNG, time)[0], one.drift * time)
+        np.testing.assert_allclose(reading.read(np.zeros(3), RNG, time)[0], reading.drift * time)
 
 
 def test_a_plain_sensor_draws_what_it_did():
     """A sensor without drift takes no further random numbers, so that episodes of seeds stay what they were."""
     first, second = np.random.default_rng(3), np.random.default_rng(3)
-    one = ForceReading(replace(QUIET, bias=0.02))
-    one.reset(first)
-    np.testing.assert_array_equal(one.bias, second.uniform(-0.02, 0.02, 3))
+    reading = ForceReading(replace(QUIET, bias=0.02))
+    reading.reset(first)
+    np.testing.assert_array_equal(reading.bias, second.uniform(-0.02, 0.02, 3))
     assert first.random() == second.random()
 
 

@@ -35,17 +35,17 @@ def actions(step: int) -> np.ndarray:
     return moves.astype(np.float32)
 
 
-def assert_equal(one: object, other: object) -> None:
+def assert_equal(value: object, other: object) -> None:
     """Nested infos, arrays, numbers and strings, to the bit."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        assert one.keys() == other.keys()
-        for key in one:
-            assert_equal(one[key], other[key])
-    elif isinstance(one, tuple) or (isinstance(one, np.ndarray) and one.dtype == object):
-        for left, right in zip(one, other, strict=True):
+    if isinstance(value, dict) and isinstance(other, dict):
+        assert value.keys() == other.keys()
+        for key in value:
+            assert_equal(value[key], other[key])
+    elif isinstance(value, tuple) or (isinstance(value, np.ndarray) and value.dtype == object):
+        for left, right in zip(value, other, strict=True):
             assert_equal(left, right)
     else:
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(value, other)
 
 
 @pytest.mark.parametrize(
@@ -65,13 +65,13 @@ def test_equals_environments_one_after_the_other(mode: str, instrument: str):
     assert_equal(together.reset(seed=11), apart.reset(seed=11))
     ends = 0
     for step in range(45):
-        found, expected = together.step(actions(step)), apart.step(actions(step))
-        assert_equal(found[:4], expected[:4])
-        assert_equal(found[4], expected[4])
-        ends += int((found[2] | found[3]).sum())
+        result, expected = together.step(actions(step)), apart.step(actions(step))
+        assert_equal(result[:4], expected[:4])
+        assert_equal(result[4], expected[4])
+        ends += int((result[2] | result[3]).sum())
     assert ends >= 3
-    for one, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
-        assert one.unwrapped.save_state() == other.unwrapped.save_state()
+    for env, other in zip(together.envs, apart.envs, strict=True):  # type: ignore[attr-defined]
+        assert env.unwrapped.save_state() == other.unwrapped.save_state()
     together.close()
     apart.close()
 
@@ -104,12 +104,12 @@ def test_a_paused_environment_stays_as_it_is_until_it_is_reset():
         given = actions(step)
         expected = whole.step(given)
         given[1] = np.nan
-        found = paused.step(given)
+        result = paused.step(given)
         for lane in (0, 2):
-            assert_equal(tuple(part[lane] for part in found[:4]), tuple(part[lane] for part in expected[:4]))
-        np.testing.assert_array_equal(found[0][1], seen)
-        assert (found[1][1], found[2][1], found[3][1]) == (0.0, False, False)
-        assert not found[4]["_force_peak"][1] and found[4]["_force_peak"][0]
+            assert_equal(tuple(part[lane] for part in result[:4]), tuple(part[lane] for part in expected[:4]))
+        np.testing.assert_array_equal(result[0][1], seen)
+        assert (result[1][1], result[2][1], result[3][1]) == (0.0, False, False)
+        assert not result[4]["_force_peak"][1] and result[4]["_force_peak"][0]
     assert paused.envs[1].unwrapped.save_state() == state
     paused.reset(seed=[0, 7, 0], options={"reset_mask": np.array([False, True, False])})
     paused.step(actions(5))
@@ -117,7 +117,7 @@ def test_a_paused_environment_stays_as_it_is_until_it_is_reset():
 
 
 def test_an_environment_whose_episode_is_over_can_be_paused():
-    """Where Gymnasium asks for a reset; if all are paused, nothing at all is computed."""
+    """Gymnasium asks for a reset there; if all are paused, nothing at all is computed."""
     envs = side_by_side(autoreset_mode="Disabled", max_episode_steps=2)
     envs.reset(seed=0)
     still = np.zeros((COUNT, 4), dtype=np.float32)
@@ -138,13 +138,13 @@ def test_a_fault_leaves_the_neighbours_untouched():
             envs.step(actions(step))
     spoilt.envs[1].unwrapped.simulation.organ_state.node_velocity[40, 1] = np.nan
     for step in range(4, 9):
-        found, expected = spoilt.step(actions(step)), whole.step(actions(step))
+        result, expected = spoilt.step(actions(step)), whole.step(actions(step))
         if step == 4:
-            assert found[2][1] and "no longer finite" in found[4]["final_info"]["sim_fault"][1]
-            assert np.isfinite(found[4]["final_obs"][1]).all() and np.isfinite(found[0]).all()
+            assert result[2][1] and "no longer finite" in result[4]["final_info"]["sim_fault"][1]
+            assert np.isfinite(result[4]["final_obs"][1]).all() and np.isfinite(result[0]).all()
         for lane in (0, 2):
-            np.testing.assert_array_equal(found[0][lane], expected[0][lane])
-            assert found[1][lane] == expected[1][lane]
+            np.testing.assert_array_equal(result[0][lane], expected[0][lane])
+            assert result[1][lane] == expected[1][lane]
 
 
 def test_states_are_saved_and_loaded_as_alone():

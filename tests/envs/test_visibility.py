@@ -1,4 +1,4 @@
-"""Which share of a disc is seen: shapes whose shadow is known in closed form, and pictures of the same."""
+"""Visible share of a disc: shapes whose shadow is known in closed form, and pictures of the same."""
 
 import math
 
@@ -83,8 +83,8 @@ def test_a_balls_shadow_is_a_disc(kind, radius):
     distance = EYE[2] - HEIGHT
     shadow = EYE[2] * math.tan(math.asin(radius / distance))
     sizes = f"{radius}" if kind == "sphere" else f"{radius} {radius} {radius}"
-    found = seen(geoms=f'<geom type="{kind}" size="{sizes}" pos="0 0 {HEIGHT}"/>')
-    assert found == pytest.approx(1.0 - (shadow / RADIUS) ** 2, abs=0.01)
+    share = seen(geoms=f'<geom type="{kind}" size="{sizes}" pos="0 0 {HEIGHT}"/>')
+    assert share == pytest.approx(1.0 - (shadow / RADIUS) ** 2, abs=0.01)
 
 
 def test_a_balls_shadow_from_the_side_is_an_ellipse():
@@ -92,16 +92,16 @@ def test_a_balls_shadow_from_the_side_is_an_ellipse():
     radius, far = 0.003, 10.0
     towards = np.array([1.0, 0.0, 1.0]) / math.sqrt(2.0)
     place = 0.02 * towards
-    found = seen(geoms=f'<geom type="sphere" size="{radius}" pos="{place[0]} 0 {place[2]}"/>', eye=far * towards)
-    assert found == pytest.approx(1.0 - math.sqrt(2.0) * (radius / RADIUS) ** 2, abs=0.01)
+    share = seen(geoms=f'<geom type="sphere" size="{radius}" pos="{place[0]} 0 {place[2]}"/>', eye=far * towards)
+    assert share == pytest.approx(1.0 - math.sqrt(2.0) * (radius / RADIUS) ** 2, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", ["capsule", "cylinder"])
 def test_a_long_capsule_across_hides_a_strip(kind):
     radius = 0.002
     half = EYE[2] * math.tan(math.asin(radius / (EYE[2] - HEIGHT))) / RADIUS
-    found = seen(geoms=f'<geom type="{kind}" size="{radius} 0.05" pos="0 0 {HEIGHT}" euler="0 90 0"/>')
-    assert found == pytest.approx(2.0 * segment(half), abs=0.01)
+    share = seen(geoms=f'<geom type="{kind}" size="{radius} 0.05" pos="0 0 {HEIGHT}" euler="0 90 0"/>')
+    assert share == pytest.approx(2.0 * segment(half), abs=0.01)
 
 
 def test_a_capsule_has_round_ends_and_a_cylinder_flat_ones():
@@ -110,15 +110,15 @@ def test_a_capsule_has_round_ends_and_a_cylinder_flat_ones():
     ball = EYE[2] * math.tan(math.asin(radius / (EYE[2] - HEIGHT - half)))
     flat = EYE[2] * radius / (EYE[2] - HEIGHT - half)
     for kind, shadow in (("capsule", ball), ("cylinder", flat)):
-        found = seen(geoms=f'<geom type="{kind}" size="{radius} {half}" pos="0 0 {HEIGHT}"/>')
-        assert found == pytest.approx(1.0 - (shadow / RADIUS) ** 2, abs=0.01)
+        share = seen(geoms=f'<geom type="{kind}" size="{radius} {half}" pos="0 0 {HEIGHT}"/>')
+        assert share == pytest.approx(1.0 - (shadow / RADIUS) ** 2, abs=0.01)
 
 
 def test_a_box_hides_what_its_upper_face_hides():
     half, thick = 0.003, 0.001
     shadow = EYE[2] / (EYE[2] - HEIGHT - thick)
-    found = seen(geoms=f'<geom type="box" size="{half} {half} {thick}" pos="0 0 {HEIGHT}" euler="0 0 30"/>')
-    assert found == pytest.approx(1.0 - (2.0 * half * shadow / RADIUS) ** 2 / math.pi, abs=0.01)
+    share = seen(geoms=f'<geom type="box" size="{half} {half} {thick}" pos="0 0 {HEIGHT}" euler="0 0 30"/>')
+    assert share == pytest.approx(1.0 - (2.0 * half * shadow / RADIUS) ** 2 / math.pi, abs=0.01)
 
 
 def test_what_is_not_shown_and_not_felt_hides_nothing():

@@ -6,7 +6,7 @@ from numba.core.runtime import _nrt_python, rtsys
 
 
 def allocations(call: Any, *given: Any) -> int:
-    """How often numba's runtime takes memory, or a header for an array, during one call."""
+    """Number of times numba's runtime takes memory, or an array's header, in a call."""
     _nrt_python.memsys_enable_stats()
     before = rtsys.get_allocation_stats()
     call(*given)

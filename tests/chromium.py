@@ -155,7 +155,7 @@ class Browser(Link):
         )
 
     def becomes(self, condition: Callable[[], Any], timeout: float) -> bool:
-        """Whether something becomes true on the server's side within some time [s], while the page goes on."""
+        """True if a condition holds on the server's side within `timeout` [s], while the page goes on."""
         deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
@@ -242,15 +242,15 @@ class Browser(Link):
 
     def complaints(self) -> list[str]:
         """Errors on the page's console, and what the browser refused."""
-        found = []
+        messages = []
         for event in self.events:
             if event.get("method") == "Runtime.exceptionThrown":
-                found.append(
+                messages.append(
                     event["params"]["exceptionDetails"].get("text", "")
                     + str(event["params"]["exceptionDetails"].get("exception", {}).get("description"))
                 )
             if event.get("method") == "Log.entryAdded" and event["params"]["entry"]["level"] == "error":
-                found.append(event["params"]["entry"]["text"] + " " + event["params"]["entry"].get("url", ""))
+                messages.append(event["params"]["entry"]["text"] + " " + event["params"]["entry"].get("url", ""))
             if event.get("method") == "Runtime.consoleAPICalled" and event["params"]["type"] == "error":
-                found.append(str([one.get("value") for one in event["params"]["args"]]))
-        return found
+                messages.append(str([argument.get("value") for argument in event["params"]["args"]]))
+        return messages

@@ -1,4 +1,4 @@
-"""What several test modules share: patience, a browser and random meshes."""
+"""Shared fixtures and settings: patience, a browser and random meshes."""
 
 from collections.abc import Callable, Iterator
 

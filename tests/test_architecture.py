@@ -226,7 +226,7 @@ def kernels_repeat_to_the_bit(source: Source) -> Iterator[str]:
 
 
 def rounding_is_fixed(source: Source) -> Iterator[str]:
-    """What decides an episode calls no function whose rounding or order of sums differs by processor or by library."""
+    """Code deciding an episode calls no function whose rounding or order of sums differs by processor or library."""
     if not source.path.startswith(DECIDING) or source.path in KERNEL_FILES:
         return
     allowed = UNFIXED_ROUNDING.get(source.path, ((), ""))[0]
@@ -278,7 +278,7 @@ def gymnasium_stays_above(source: Source) -> Iterator[str]:
 
 
 def patients_are_data(source: Source) -> Iterator[str]:
-    """What makes an organ of a scan writes a scene; it runs no simulation."""
+    """Code making organs of scans writes scenes; it runs no simulation."""
     if source.path.startswith("surgsim_apps/patient/"):
         for name, line in imported(source.tree):
             if name.split(".")[0] == "mujoco" or name.startswith("surgsim_env.coupling"):

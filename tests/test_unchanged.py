@@ -69,8 +69,8 @@ def lines(value: object, path: str = "") -> Iterator[str]:
         yield f"{path} {plain.dtype} {plain.shape} {digest} {short}"
     elif isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
         yield f"{path} {len(value)} entries"
-        for number, one in enumerate(value):
-            yield from lines(one, f"{path}[{number}]")
+        for number, entry in enumerate(value):
+            yield from lines(entry, f"{path}[{number}]")
     elif isinstance(value, str | np.str_) or (isinstance(value, np.ndarray) and value.dtype.kind == "U"):
         # Messages may be reworded: whether there is one counts.
         yield f"{path} text {bool(str(value))}"
@@ -91,8 +91,8 @@ def parsed(value: object) -> object:
         except ValueError:
             return value
     if isinstance(value, dict):
-        return {key: parsed(one) for key, one in value.items()}
-    return [parsed(one) for one in value] if isinstance(value, list) else value
+        return {key: parsed(entry) for key, entry in value.items()}
+    return [parsed(entry) for entry in value] if isinstance(value, list) else value
 
 
 def saved(env: gym.Env) -> dict[str, object]:
@@ -372,12 +372,14 @@ def recorded() -> dict[str, dict[str, str]]:
     return {name: hashed for key in (NO_MUJOCO, MUJOCO) for name, hashed in record.get(key, {}).items()}
 
 
-def changed(name: str, found: dict[str, str]) -> list[str]:
+def changed(name: str, part_hashes: dict[str, str]) -> list[str]:
     """The parts of a case that differ from the record."""
     known = recorded()
     if name not in known:
         pytest.skip(f"{name!r} is not recorded for {MUJOCO}, whose results are its own: {RECORD}")
-    return sorted(part for part in found.keys() | known[name].keys() if found.get(part) != known[name].get(part))
+    return sorted(
+        part for part in part_hashes.keys() | known[name].keys() if part_hashes.get(part) != known[name].get(part)
+    )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -429,9 +431,9 @@ def test_another_machine_gives_the_same(variation: str, tmp_path: Path):
         timeout=1800,
     )
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert set(found) == set(CASES)
-    differing = {name: parts for name, hashed in found.items() if (parts := changed(name, hashed))}
+    case_hashes = json.loads(done.stdout.splitlines()[-1])
+    assert set(case_hashes) == set(CASES)
+    differing = {name: parts for name, hashed in case_hashes.items() if (parts := changed(name, hashed))}
     assert not differing, f"{variation}: changed: {differing}"
 
 

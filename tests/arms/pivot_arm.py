@@ -74,6 +74,6 @@ def pivot_coordinates(point):
 
 
 def pivot_excess(point):
-    """How far beyond the limits a point lies, in yaw, pitch [rad] and depth [m]; negative within."""
+    """Excess of a point over the limits of yaw, pitch [rad] and depth [m]; negative within."""
     yaw, pitch, depth = pivot_coordinates(point)
     return abs(yaw) - YAW, abs(pitch) - PITCH, max(NEAR - depth, depth - FAR)

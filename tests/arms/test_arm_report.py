@@ -1,4 +1,4 @@
-"""What the report, its tables and maps say of an evaluation is what its arrays hold."""
+"""The report, its tables and maps show what the arrays of an evaluation hold."""
 
 import csv
 import re

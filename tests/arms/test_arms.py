@@ -80,7 +80,7 @@ def test_shapes_and_targets(evaluation, phantom):
 
 
 def test_what_is_reported_is_so(evaluation):
-    """Where a point is reached everything is known, the tip is there and both arms keep 5 mm apart."""
+    """At reached points everything is known, the tip is there and both arms keep 5 mm apart."""
     for arm in (evaluation.left, evaluation.right):
         good = arm.reachable
         assert good[:25].all() and not good[26]
@@ -163,16 +163,16 @@ def test_mirrored_scene_has_the_mirrored_report():
     (x, y, z), (u, v, w) = ports.endoscope.point, ports.endoscope.target
     other_ports = Ports(mirrored_place(ports.right), mirrored_place(ports.left), EndoscopePort((-x, y, z), (-u, v, w)))
     arm = mirrored_description()
-    one = evaluate_arms(anatomy, arm, arm, ports, count=30)
+    evaluation = evaluate_arms(anatomy, arm, arm, ports, count=30)
     other = evaluate_arms(mirrored(anatomy), arm, arm, other_ports, count=30)
-    assert other.points * [-1.0, 1.0, 1.0] == pytest.approx(one.points, abs=1e-12)
-    for mine, theirs in ((one.left, other.right), (one.right, other.left)):
+    assert other.points * [-1.0, 1.0, 1.0] == pytest.approx(evaluation.points, abs=1e-12)
+    for mine, theirs in ((evaluation.left, other.right), (evaluation.right, other.left)):
         assert mine.reason.tolist() == theirs.reason.tolist()
         assert mine.reachable.any()
         for name, values in arm_figures(mine).items():
             assert getattr(theirs, name) == pytest.approx(values, rel=1e-4, abs=2e-6, nan_ok=True), name
-    assert one.both.tolist() == other.both.tolist()
-    assert other.arm_distance_inside == pytest.approx(one.arm_distance_inside, abs=2e-6, nan_ok=True)
+    assert evaluation.both.tolist() == other.both.tolist()
+    assert other.arm_distance_inside == pytest.approx(evaluation.arm_distance_inside, abs=2e-6, nan_ok=True)
 
 
 def test_default_ports_follow_the_rules(phantom):
@@ -305,10 +305,10 @@ def test_pictures_show_the_fine_surface(phantom, tmp_path):
     trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "own.ply")
     fine = FineSurface(str(tmp_path / "own.ply"), "m")
     anatomy = load_anatomy(replace(scene, mesh=replace(scene.mesh, fine_surface=fine)))
-    one = evaluate_arms(anatomy, "psm_grasper", "psm_grasper", count=2)
-    assert len(one.surface_triangles) == len(faces) > len(mesh.boundary_triangles)
+    evaluation = evaluate_arms(anatomy, "psm_grasper", "psm_grasper", count=2)
+    assert len(evaluation.surface_triangles) == len(faces) > len(mesh.boundary_triangles)
     other = evaluate_arms(phantom, "psm_grasper", "psm_grasper", count=2)
-    np.testing.assert_array_equal(one.points, other.points)
+    np.testing.assert_array_equal(evaluation.points, other.points)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Which points an arm reaches, against sets that are known; and what stops it, with things put in its way."""
+"""Points that an arm reaches, against known sets; and what stops it, with obstacles put in its way."""
 
 import math
 

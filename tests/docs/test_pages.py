@@ -43,7 +43,7 @@ def resolved(name: str) -> object:
     parts = name.split(".")
     for count in range(len(parts), 0, -1):
         try:
-            found: object = importlib.import_module(".".join(parts[:count]))
+            value: object = importlib.import_module(".".join(parts[:count]))
         except ModuleNotFoundError as error:
             if error.name is not None and not name.startswith(error.name.partition(".")[0]):
                 # It is there, and asks for an extra that is not.
@@ -51,15 +51,15 @@ def resolved(name: str) -> object:
             continue
         for attribute in parts[count:]:
             try:
-                there = hasattr(found, attribute)
+                there = hasattr(value, attribute)
             except ImportError as error:
                 # A name that is imported when it is used, from an extra that is not installed.
                 return error.name
             # A dataclass's field without a default is no attribute of the class.
-            if not there and attribute not in getattr(found, "__annotations__", {}):
+            if not there and attribute not in getattr(value, "__annotations__", {}):
                 return None
-            found = getattr(found, attribute, name)
-        return found
+            value = getattr(value, attribute, name)
+        return value
     return None
 
 
@@ -73,10 +73,10 @@ def resolved(name: str) -> object:
 )
 def test_the_reference_has_every_public_name(page, names):
     text = (ROOT / "docs" / "reference" / f"{page}.md").read_text(encoding="utf-8")
-    told = set(re.findall(r"^::: [\w.]+\.(\w+)$", text, flags=re.MULTILINE))
+    documented = set(re.findall(r"^::: [\w.]+\.(\w+)$", text, flags=re.MULTILINE))
     # The text names the others: constants, modules, and types that stand with what takes them.
     elsewhere = {"scripting", "register", "MeshError", "OrganError", "OrganDivergedError"}
-    for name in set(names) - told - {"Script", "Step", "StepFailed"} - elsewhere:
+    for name in set(names) - documented - {"Script", "Step", "StepFailed"} - elsewhere:
         assert re.search(rf"`(surgsim_env\.)?{name}`", text), name
 
 
@@ -98,11 +98,11 @@ IDS = sorted(id for id in gym.registry if id.startswith("SurgSim/"))
 @pytest.mark.parametrize("id", IDS)
 def test_tables_have_every_command_channel_and_reward(id):
     task, text = TASKS[id], hook("generated_parts").environment_text(id)
-    _, told = docstring_sections(text)
+    _, sections = docstring_sections(text)
     for heading, parts in (
         ("Action Space", task.commands), ("Observation Space", task.channels), ("Rewards", task.rewards)
     ):  # fmt: skip
-        rows = re.findall(r"^\| `(\w+)` \| (\S[^|]*) \|", told[heading], flags=re.MULTILINE)
+        rows = re.findall(r"^\| `(\w+)` \| (\S[^|]*) \|", sections[heading], flags=re.MULTILINE)
         assert [name for name, _ in rows] == [part.name for part in parts]
     assert {name: float(weight) for name, weight in rows} == reward_weights(task)
 
@@ -118,4 +118,4 @@ def test_every_command_and_every_option_is_on_the_page():
         options = set(re.findall(r"^\W*(--[a-z][\w-]*)", module.said(name, "--help"), flags=re.MULTILINE)) - {"--help"}
         rows = dict(re.findall(r"^\| <code>(?:-\w, )?(--[\w-]+)[^|]*\| (.*) \|$", section, flags=re.MULTILINE))
         assert options == set(rows), name
-        assert [option for option, told in rows.items() if len(told) < 5 or told.endswith(",")] == [], name
+        assert [option for option, meaning in rows.items() if len(meaning) < 5 or meaning.endswith(",")] == [], name

@@ -17,7 +17,7 @@ FETCHED = {"img": "src", "script": "src", "link": "href", "source": "src", "ifra
 
 
 class Html(html.parser.HTMLParser):
-    """What a page holds: ids, links, and what it makes a browser fetch."""
+    """Ids and links of a page, and what it makes a browser fetch."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -45,8 +45,8 @@ def site_folder() -> Path:
 @pytest.fixture(scope="module")
 def site(site_folder) -> dict[str, Html]:
     """Every page of the built site, by its path."""
-    found = site_folder.rglob("*.html")
-    return {path.relative_to(site_folder).as_posix(): Html(path.read_text(encoding="utf-8")) for path in found}
+    paths = site_folder.rglob("*.html")
+    return {path.relative_to(site_folder).as_posix(): Html(path.read_text(encoding="utf-8")) for path in paths}
 
 
 def pages(site: dict[str, Html]) -> dict[str, Html]:

@@ -45,8 +45,8 @@ class Block(NamedTuple):
 
 
 def blocks(page: str) -> list[Block]:
-    found = re.findall(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', page, flags=re.MULTILINE | re.DOTALL)
-    return [Block(*one) for one in found]
+    matches = re.findall(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', page, flags=re.MULTILINE | re.DOTALL)
+    return [Block(*match) for match in matches]
 
 
 def page(name: str, *, quick: bool = True) -> str:
@@ -57,28 +57,28 @@ def page(name: str, *, quick: bool = True) -> str:
     return text
 
 
-def agrees(printed: str, told: str, *, words_alone: bool = False) -> bool:
-    """Whether all words are the same and all numbers nearly so."""
-    one, other = (" ".join(text.split()) for text in (printed, told))
-    if words_alone or NUMBER.sub("#", one) != NUMBER.sub("#", other):
-        return NUMBER.sub("#", one) == NUMBER.sub("#", other) and words_alone
-    pairs = zip(map(float, NUMBER.findall(one)), map(float, NUMBER.findall(other)))
+def agrees(printed: str, expected: str, *, words_alone: bool = False) -> bool:
+    """True if all words are the same and all numbers nearly so."""
+    printed, expected = (" ".join(text.split()) for text in (printed, expected))
+    if words_alone or NUMBER.sub("#", printed) != NUMBER.sub("#", expected):
+        return NUMBER.sub("#", printed) == NUMBER.sub("#", expected) and words_alone
+    pairs = zip(map(float, NUMBER.findall(printed)), map(float, NUMBER.findall(expected)))
     return all(abs(a - b) <= max(ABSOLUTE, RELATIVE * abs(b)) for a, b in pairs)
 
 
-def holds(printed: str, told: str) -> bool:
-    """Whether each line of one text is a part of the other, in order, all words the same and all numbers nearly so.
+def holds(printed: str, expected: str) -> bool:
+    """True if each expected line is part of what is printed, in order, all words the same and all numbers nearly so.
 
     A table wraps its cells where the console ends, so that neither its frame nor the breaks of lines count.
     """
     rest = " ".join(FRAME.sub(" ", printed).split())
-    for line in FRAME.sub(" ", told).splitlines():
+    for line in FRAME.sub(" ", expected).splitlines():
         words = [re.escape(part) for part in NUMBER.split(" ".join(line.split()))]
         parts = re.finditer(NUMBER.pattern.join(words), rest)
-        found = next((part for part in parts if agrees(part[0], line)), None)
-        if found is None:
+        match = next((part for part in parts if agrees(part[0], line)), None)
+        if match is None:
             return False
-        rest = rest[found.end() :]
+        rest = rest[match.end() :]
     return True
 
 
@@ -99,11 +99,11 @@ def run_tutorial(text: str, name: str, capsys: pytest.CaptureFixture[str]) -> No
     for block in blocks(text):
         if block.title.startswith("prints"):
             printed, words_alone = capsys.readouterr().out, "trained" in block.title
-            told = f"{name} prints\n{printed}\nand says\n{block.text}"
+            message = f"{name} prints\n{printed}\nand says\n{block.text}"
             if "among others" in block.title:
-                assert holds(printed, block.text), told
+                assert holds(printed, block.text), message
             else:
-                assert agrees(printed, block.text, words_alone=words_alone), told
+                assert agrees(printed, block.text, words_alone=words_alone), message
         elif block.title:
             Path(block.title).write_text(block.text, encoding="utf-8")
         elif block.language == "sh":

@@ -41,7 +41,7 @@ class Felt(NamedTuple):
 
 
 def felt(anatomy: Anatomy, seconds: float, *, held: bool = False, deeper: float = 0.0) -> Felt:
-    """What a stiff hand feels that goes down to DEPTH, or deeper, and stays there."""
+    """Records of a stiff hand that goes down to DEPTH, or deeper, and stays there."""
     simulation = Simulation(anatomy)
     simulation.hold_breath(held)
     simulation.reset(anatomy.organ(), START)

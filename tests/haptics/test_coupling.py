@@ -1,4 +1,4 @@
-"""How stiff a coupling may be: the limit's own inequality, its known special cases, and what is refused."""
+"""Stiffness limit of a coupling: its inequality, its known special cases, and what is refused."""
 
 import math
 

@@ -23,7 +23,7 @@ def test_the_example_presses(capsys):
 
 
 class Turns:
-    """What the bridge takes for the module `time`: while it sleeps, the loop makes a step."""
+    """Stand-in for the bridge's module `time`: while it sleeps, the loop makes a step."""
 
     now = 100.0
 

@@ -81,7 +81,7 @@ def picture(browser) -> np.ndarray:
 
 
 def seen_at(browser, page, place) -> tuple[float, float]:
-    """Where a place of the scene [m] is on the page [pixels]."""
+    """Position on the page [pixels] of a scene's place [m]."""
     box = browser.run(f"(() => {{ const r = {CANVAS}; return [r.x, r.y, r.width, r.height]; }})()")
     camera = page_camera(page.session.anatomy)
     at, _ = camera.project(np.array([place]), box[2], box[3])
@@ -134,11 +134,11 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         browser.wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
         browser.wait_for("document.body.innerText.includes('Continue')")
         # viser's camera complains of its own way to hear the wheel.
-        assert [one for one in browser.complaints() if "passive event listener" not in one] == []
+        assert [complaint for complaint in browser.complaints() if "passive event listener" not in complaint] == []
 
 
 def is_red(shot: np.ndarray) -> np.ndarray:
-    """Which pixels of a picture are of the organ."""
+    """Mask of the organ's pixels in a picture."""
     return (shot[:, :, 0] > 1.6 * shot[:, :, 2]) & (shot[:, :, 0] > 60)
 
 

@@ -45,7 +45,7 @@ if __name__ == "__main__":
 
 
 def hear_ctrl_c() -> None:
-    """What runs in the background of a shell, as tests may, is started deaf to it."""
+    """Restore the default of SIGINT, which a shell's background jobs ignore."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

@@ -1,4 +1,4 @@
-"""What `drawing.js` makes of a browser that draws in software, on a page of nothing."""
+"""Effect of `drawing.js` on a browser that draws in software, on a plain page."""
 
 from importlib.resources import files
 

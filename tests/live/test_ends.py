@@ -1,4 +1,4 @@
-"""How a session ends: with its page, without its physics, or before it begins."""
+"""End of a session: with its page, without its physics, or before it begins."""
 
 import os
 import signal
@@ -69,7 +69,7 @@ def test_a_physics_that_dies_is_said(tmp_path):
 
 
 def test_why_the_physics_refused_is_said(monkeypatch):
-    """What only the child finds out."""
+    """A fault only the child finds."""
     monkeypatch.setattr(
         "surgsim_apps.live.session.OrganChoice", lambda lesions: OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)
     )

@@ -11,7 +11,7 @@ from surgsim_env.scene.anatomy import load_anatomy
 
 
 class Sent:
-    """What a viser scene is given: meshes by name, the last one of each."""
+    """Meshes given to a viser scene, by name, the last one of each."""
 
     def __init__(self) -> None:
         self.meshes = {}

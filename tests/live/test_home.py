@@ -1,4 +1,4 @@
-"""Where tips begin: in sight, and touching nothing, whatever the instrument is."""
+"""Start of tips: in sight, and touching nothing, whatever the instrument is."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the panel shows, and what its elements call, with a gui that keeps its elements by label."""
+"""Contents of the panel and calls of its elements, with a gui that keeps its elements by label."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace

@@ -57,7 +57,7 @@ class Bench:
             hand["beat"] += beats
 
     def step(self, count: int, place=None, buttons: int = 0) -> None:
-        """What `Physics.run` does in as many steps, without the clock."""
+        """`count` steps of `Physics.run`, without the clock."""
         for _ in range(count):
             if place is not None:
                 self.hold(place, buttons=buttons)

@@ -21,7 +21,7 @@ env.reset(seed=0); env.step(env.action_space.sample()); env.close()
 
 
 def run(*command: str) -> str:
-    """What a command prints; it must succeed."""
+    """Output of a command; it must succeed."""
     begin = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True)
     print(f"{time.perf_counter() - begin:6.1f} s  {command[-1].strip().splitlines()[-1]}", flush=True)

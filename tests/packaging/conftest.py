@@ -36,8 +36,8 @@ class Environment:
 
     @property
     def site_packages(self) -> Path:
-        (found,) = self.folder.glob("lib/python*/site-packages")
-        return found
+        (packages,) = self.folder.glob("lib/python*/site-packages")
+        return packages
 
     def install(self, *arguments: str | Path) -> None:
         pip = [
@@ -61,7 +61,7 @@ def run(command: list[str | Path], *, expect: int = 0, **options) -> str:
 
 
 def copy_of_project(target: Path) -> Path:
-    """What a build reads, so that a test may change it."""
+    """Copy of a build's inputs, for a test to change."""
     target.mkdir(parents=True)
     for name in BUILD_INPUTS:
         source = REPOSITORY / name

@@ -26,10 +26,10 @@ def pins(python: str) -> dict[str, str]:
     for line in LINES:
         if line.startswith("#"):
             continue
-        one = Requirement(line)
-        if one.marker is None or one.marker.evaluate(environment):
-            (pin,) = one.specifier
-            assert pin.operator == "==" and known.setdefault(same(one.name), pin.version) == pin.version, line
+        requirement = Requirement(line)
+        if requirement.marker is None or requirement.marker.evaluate(environment):
+            (pin,) = requirement.specifier
+            assert pin.operator == "==" and known.setdefault(same(requirement.name), pin.version) == pin.version, line
     return known
 
 
@@ -37,8 +37,8 @@ def pins(python: str) -> dict[str, str]:
 def test_what_make_installs_is_pinned_within_its_bounds(python):
     known = pins(python)
     assert not known.keys() & {"torch", "triton"}
-    asked = [*PROJECT["dependencies"], *(one for extra in EXTRAS for one in PROJECT["optional-dependencies"][extra])]
+    asked = [*PROJECT["dependencies"], *(line for extra in EXTRAS for line in PROJECT["optional-dependencies"][extra])]
     for text in asked:
-        one = Requirement(text)
-        if one.name != "torch":
-            assert one.specifier.contains(known.get(same(one.name), "0")), f"{text}: run `make lock`"
+        requirement = Requirement(text)
+        if requirement.name != "torch":
+            assert requirement.specifier.contains(known.get(same(requirement.name), "0")), f"{text}: run `make lock`"

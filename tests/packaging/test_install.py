@@ -41,9 +41,9 @@ def test_wheel_says_that_its_packages_are_typed(wheel):
 def test_installed_wheel_finds_its_scenes(wheel, make_environment, tmp_path, clean_environ):
     environment: Environment = make_environment(tmp_path / "venv")
     environment.install(wheel)
-    found = Path(run([environment.python, "-c", WHERE], cwd=tmp_path, env=clean_environ).strip())
-    assert found == environment.site_packages / "surgsim_env" / "assets"
-    shipped = sorted(path.name for path in found.glob("organs/*.toml"))
+    scenes = Path(run([environment.python, "-c", WHERE], cwd=tmp_path, env=clean_environ).strip())
+    assert scenes == environment.site_packages / "surgsim_env" / "assets"
+    shipped = sorted(path.name for path in scenes.glob("organs/*.toml"))
     assert shipped == sorted(path.name for path in (REPOSITORY / "scenes").glob("organs/*.toml")) != []
     assert (environment.folder / "bin" / "surgsim").is_file()
     known = run([environment.python, "-c", LIST], cwd=tmp_path, env=clean_environ).split()
@@ -80,9 +80,9 @@ def test_editable_install_sees_an_edit_at_once(
     environment.install("--editable", project)
     (project / "scenes" / "organs" / "planted.toml").write_text("# new since the installation\n")
 
-    found = Path(run([environment.python, "-c", WHERE], cwd=tmp_path, env=clean_environ).strip())
+    scenes = Path(run([environment.python, "-c", WHERE], cwd=tmp_path, env=clean_environ).strip())
 
-    assert found == project / "scenes"
-    assert (found / "organs" / "planted.toml").is_file()
+    assert scenes == project / "scenes"
+    assert (scenes / "organs" / "planted.toml").is_file()
     stale = environment.site_packages / "surgsim_env" / "assets"
     assert not (stale / "organs" / "planted.toml").exists()

@@ -1,4 +1,4 @@
-"""What tests of `surgsim organ` and `surgsim palpate` share: a written organ, and the line of a refusal."""
+"""Fixtures for `surgsim organ` and `surgsim palpate`: a written organ, and the line of a refusal."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What holds a patient's organ: fat by default, attachments by the organ's name in the axes of a scan."""
+"""Supports of an organ: fat by default, attachments by the organ's name in the axes of a scan."""
 
 import numpy as np
 import pytest

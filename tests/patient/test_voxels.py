@@ -27,7 +27,7 @@ def block(*missing):
 
 
 def is_block(inside, first, *corners):
-    """Whether just the voxels of blocks with these first voxels are inside; of one at 0 by default."""
+    """True if just the voxels of blocks with these first voxels are inside; of one at 0 by default."""
     expected = np.zeros(inside.shape, dtype=bool)
     for corner in corners or [(0, 0, 0)]:
         expected[tuple(slice(low, low + n) for low, n in zip(np.array(corner) - first, COUNTS))] = True

@@ -59,7 +59,7 @@ def stl(surface: trimesh.Trimesh, path: Path) -> Path:
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What a command prints, from which nothing must be missing or amiss."""
+    """Standard output and standard error of a command that must succeed."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 0
     printed = capsys.readouterr()
@@ -67,7 +67,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 def fits(anatomy: Anatomy, point: np.ndarray, radius: float) -> bool:
-    """Whether a lesion lies inside the organ."""
+    """True if a lesion lies inside the organ."""
     try:
         anatomy.check_inside(anatomy.lesion_at(tuple(point.tolist()), radius, LESION_RATIO, "tried"))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Where cameras stand and what they see, by geometry. Needs no OpenGL."""
+"""Positions and views of cameras, by geometry. Needs no OpenGL."""
 
 import math
 

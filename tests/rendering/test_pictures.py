@@ -1,4 +1,4 @@
-"""What pictures show, against geometry: where things are, how far, what they are called, and that they move."""
+"""Pictures against geometry: where things are, how far, what they are called, and that they move."""
 
 import copy
 

@@ -30,7 +30,7 @@ print(sorted(name for name in sys.modules if name.split(".")[0] == "OpenGL" or n
 
 
 def run(code: str, **environment: str) -> str:
-    """What a fresh interpreter prints, without a display."""
+    """Output of a fresh interpreter, without a display."""
     inherited = {key: value for key, value in os.environ.items() if key not in (*gl.DISPLAYS, gl.VARIABLE)}
     done = subprocess.run(
         [sys.executable, "-c", code],

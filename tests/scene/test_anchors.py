@@ -1,4 +1,4 @@
-"""Where an organ is held: fixed nodes and elastic tissue by box, ball and side; sites clear of both; bad input."""
+"""Anchors of an organ: fixed nodes and elastic tissue by box, ball and side; sites clear of both; bad input."""
 
 import math
 import tomllib

@@ -85,13 +85,13 @@ def test_no_work_is_done_on_a_closed_path(name):
 @pytest.mark.parametrize("name", SOLIDS)
 def test_the_tangent_is_the_derivative_of_the_stress(name):
     solid, step = SOLIDS[name], 1e-6
-    found = solid.tangent(GRADIENT)
+    tangent = solid.tangent(GRADIENT)
     for i in range(3):
         for j in range(3):
             change = np.zeros((3, 3))
             change[i, j] = step
             slope = (solid.first_piola(GRADIENT + change) - solid.first_piola(GRADIENT - change)) / (2.0 * step)
-            np.testing.assert_allclose(found[:, :, i, j], slope, rtol=1e-5, atol=1e-4 * BULK)
+            np.testing.assert_allclose(tangent[:, :, i, j], slope, rtol=1e-5, atol=1e-4 * BULK)
 
 
 def test_the_lattice_is_a_quadrature_of_degree_5():

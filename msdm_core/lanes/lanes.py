@@ -246,16 +246,21 @@ def put_lane(state: LaneState, lane: int, organ: OrganState) -> None:
     state.lane_fault[lane] = FAULT_NONE
 
 
+def take_lane(state: LaneState, lane: int, organ: OrganState) -> None:
+    """Set an organ's state to that of its lane, in float64; its scratch stays."""
+    for field in PART_FIELDS:
+        values = getattr(organ, field.name)
+        values[...] = _lane_part(field, state, lane)[tuple(map(slice, values.shape))]
+
+
 def get_lane(state: LaneState, lane: int) -> OrganState:
-    """Copy of a lane's state as that of an organ alone, in float64: for measures, saved states, fault messages."""
+    """Copy of a lane's state as that of an organ alone, in float64."""
     parts = {field: _lane_part(field, state, lane) for field in STATE_FIELDS if field.lanes != "alone"}
     sizes = field_sizes(parts, parts.values())
     surface, points = state.surface_count[lane], QUADRATURE_COUNT * state.surface_count[lane]
     sizes |= {"n_surface": surface, "n_point": points, "n_row": points * sizes["n_shape"]}
     organ = zero_state(sizes | {"n_support_node": state.support_count[lane]})
-    for field in PART_FIELDS:
-        values = getattr(organ, field.name)
-        values[...] = parts[field][tuple(map(slice, values.shape))]
+    take_lane(state, lane, organ)
     return organ
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from msdm_core.kernels.structure_kernels import LANE_EMPTY, OrganModel
 from msdm_core.lanes.lanes import (
-    get_lane,
     lane_responses,
     lane_shapes,
     put_lane,
@@ -18,6 +17,7 @@ from msdm_core.lanes.lanes import (
     stack_organs,
     stack_shapes,
     stack_states,
+    take_lane,
 )
 from surgsim_env.coupling.exchange import step_outcome, step_plan, steps_taken
 from surgsim_env.coupling.haptic_kernels import advance_lane_haptic_steps
@@ -110,9 +110,9 @@ class LaneGroup:
         self._outcome.wrench[lane] = simulation.contact_wrench
 
     def _unload(self, lane: int, simulation: Simulation) -> None:
-        organ_state = get_lane(self._state, lane)
-        taken = steps_taken(simulation.organ_model, organ_state, self._outcome, lane)
+        take_lane(self._state, lane, simulation.organ_state)
+        taken = steps_taken(simulation.organ_model, simulation.organ_state, self._outcome, lane)
         # Tasks read the shapes: torques are about their tools' centres.
         for own, moved in zip(simulation.instrument.shapes, lane_shapes(self._shapes, lane), strict=True):
             own[...] = moved
-        simulation.end_in_lanes(organ_state, self._outcome.wrench[lane], taken)
+        simulation.end_in_lanes(self._outcome.wrench[lane], taken)

@@ -287,15 +287,13 @@ class Simulation:
         self.force_peak = self.pull_peak = 0.0
         self.begin_motion()
 
-    def end_in_lanes(self, organ_state: OrganState, wrench: FloatArray, taken: StepsTaken) -> None:
-        """End a control step in a group of lanes, which has advanced the instrument's own data.
+    def end_in_lanes(self, wrench: FloatArray, taken: StepsTaken) -> None:
+        """End a control step in a group of lanes, which has advanced the states of organ and instrument.
 
         Args:
-            organ_state: the organ's state after it.
             wrench: of the last good haptic step [N, N m], shape (n_tool, 6).
             taken: the result.
         """
-        self.organ_state = organ_state
         self._wrench[:] = wrench
         self._count(taken)
 

@@ -1,4 +1,4 @@
-"""Common parts of mesh and surface files: suffix, guarded parser, unit of length, extent."""
+"""Common parts of mesh and surface files: stand-ins, suffix, guarded parser, unit of length, extent."""
 
 import contextlib
 import io
@@ -20,7 +20,28 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 SMALLEST_EXTENT = 1e-3
 LARGEST_EXTENT = 2.0
 
+# First bytes, in lower case, of a file that stands in for the wanted one.
+STAND_INS = {
+    b"version https://git-lfs.github.com/spec/": "a Git LFS pointer: git lfs pull",
+    b"/annex/objects/": "a git-annex pointer: git annex get",
+    b"<!doctype html": "a web page: download the file itself",
+}
+
 Parsed = TypeVar("Parsed")
+
+
+def checked_content(path: Path) -> Path:
+    """Path of a file, of any format, with a content of its own; a missing file is left to its reader.
+
+    Raises:
+        MeshError: a pointer of Git LFS or git-annex, or a web page, in place of the file.
+    """
+    with contextlib.suppress(OSError), path.open("rb") as stream:
+        head = stream.read(64).lower()
+        for start, content in STAND_INS.items():
+            if head.startswith(start):
+                raise MeshError(f"{path} is {content}")
+    return path
 
 
 def checked_file(path: str | Path, suffixes: Iterable[str], advice: str) -> Path:
@@ -44,9 +65,11 @@ def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:
     A number beyond the range of its type is an error, too: numpy would change it, with a warning.
 
     Raises:
-        MeshError: names the file and the parser's own reason; a MeshError of `parse` is passed on.
+        MeshError: names the file and the parser's own reason; a MeshError of `parse` is passed on; a stand-in for the
+            file.
     """
     output = io.StringIO()
+    checked_content(file)
     try:
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             with np.errstate(over="raise", invalid="raise"):

@@ -1,8 +1,9 @@
-"""Common parts of mesh and surface files: stand-ins, suffix, guarded parser, unit of length, extent."""
+"""Common parts of mesh and surface files: stand-ins, suffix, content, guarded parser, unit of length, extent."""
 
 import contextlib
 import io
 import math
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
@@ -27,6 +28,18 @@ STAND_INS = {
     b"<!doctype html": "a web page: download the file itself",
 }
 
+# Beginnings of the formats, tried in this order.
+CONTENTS = {
+    ".vtu": rb"(?s).*<VTKFile\b[^>]*type=.UnstructuredGrid",
+    ".vtp": rb"(?s).*<VTKFile\b[^>]*type=.PolyData",
+    ".vtk": rb"# vtk DataFile",
+    ".msh": rb"\$(MeshFormat|NOD|Comments)\s",
+    ".mesh": rb"(?s).{0,200}?\bMeshVersionFormatted\b",
+    ".ply": rb"ply\s",
+    ".stl": rb"(?is)\s*solid\b.*?\bfacet\s+normal\b",
+    ".obj": rb"(?ms).*?^v\s+[-+\d.]+\S*\s+[-+\d.]+\S*\s+[-+\d.]+.*?^v\s",
+}
+
 Parsed = TypeVar("Parsed")
 
 
@@ -48,15 +61,27 @@ def checked_file(path: str | Path, suffixes: Iterable[str], advice: str) -> Path
     """Path of an existing file with one of the suffixes.
 
     Raises:
-        MeshError: no such file, or an unknown suffix; names the path and the known suffixes.
+        MeshError: no such file, an unknown suffix or a content of another; names the path and the known suffixes.
     """
-    file = Path(path)
+    file = checked_content(Path(path))
     if not file.is_file():
         raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
     known = sorted(suffixes)
     if file.suffix.lower() not in known:
         raise MeshError(f"{file}: unknown extension {file.suffix!r}; known: {', '.join(known)}: {advice}")
+    content = _content_suffix(file)
+    if content not in (None, file.suffix.lower()):
+        raise MeshError(f"{file} is a {content} by its content: rename it")
     return file
+
+
+def _content_suffix(file: Path) -> str | None:
+    """Suffix of the format that a file begins with; None for an unknown one."""
+    with file.open("rb") as stream:
+        head = stream.read(4096)
+    if file.stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little"):  # a binary STL, of n triangles
+        return ".stl"
+    return next((suffix for suffix, start in CONTENTS.items() if re.match(start, head)), None)
 
 
 def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:

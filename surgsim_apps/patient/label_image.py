@@ -32,8 +32,8 @@ class LabelName:
     value: int
 
 
-def parse_labels(text: str) -> tuple[LabelName, ...]:
-    """Tissues of a text such as "liver=1,lesion=2", the organ first.
+def parse_labels(text: str, smallest: int = 1) -> tuple[LabelName, ...]:
+    """Tissues of a text such as "liver=1,lesion=2", the organ first; labels below `smallest` are outside.
 
     Raises:
         MeshError: a part that breaks the form, a name or a label given twice.
@@ -44,7 +44,7 @@ def parse_labels(text: str) -> tuple[LabelName, ...]:
         name = name.strip()
         if not equals or not re.fullmatch(r"\s*\d{1,10}\s*", value):
             raise MeshError(f"--labels: {part!r} is no NAME=LABEL; give {FORM}")
-        if int(value) == 0:
+        if int(value) < smallest:
             raise MeshError(f"--labels: {part!r}: label 0 is outside; give {FORM}")
         names.append(LabelName(check_name(name, "--labels"), int(value)))
     for entries in ([label.name for label in names], [label.value for label in names]):

@@ -52,6 +52,7 @@ def make_patient(
     out: Path,
     *,
     labels: str | None = None,
+    cell_data: str | None = None,
     length_unit: LengthUnit | None = None,
     cell_size: float | None = None,
     mesher: str = MESHERS[0],
@@ -67,6 +68,7 @@ def make_patient(
         files: a label image; or closed surfaces, the organ's first, then one for each region; or one file of tets.
         out: path of the mesh to be written; its stem names the scene.
         labels: tissues of an image's labels or of the tags of tets, as in `parse_labels`.
+        cell_data: name of the array with the tags of tets.
         length_unit: of surfaces.
         cell_size: of the lattice, the same everywhere [m], from which the tip follows; default: cells follow from the
             tip, fine at the pressed face.
@@ -101,7 +103,8 @@ def make_patient(
         if len(files) > 1:
             raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
         with progress.step(f"reading {first.name}"):
-            contents = read_tets(first, length_unit, parse_labels(labels) if labels is not None else ())
+            tags = parse_labels(labels, smallest=0) if labels is not None else ()
+            contents = read_tets(first, length_unit, tags, cell_data)
             if remesh:
                 contents = surfaces_of_tets(contents)
         name = contents.organ.name if isinstance(contents, PatientSurfaces) else contents.names[0]

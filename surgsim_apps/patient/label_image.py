@@ -18,7 +18,9 @@ from surgsim_apps.patient.materials import check_name, is_lesion
 from surgsim_apps.patient.surface_files import region_name
 
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
-FORM = "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2"
+FORM = (
+    "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2 (a label is a number or a name of the file)"
+)
 # Smallest volume of a lesion over a cell's: a ball of half a cell's radius (the rule of `msdm_core.material.Lesion`).
 SMALLEST_SHARE_OF_CELL = np.pi / 6.0
 # Most lesions of a label, the largest of its parts; the others are noise.

@@ -127,7 +127,8 @@ def read_label_image(
 def _only_label(source: LabelSource) -> LabelName:
     present = source.present()
     if len(present) != 1:
-        raise MeshError(f"{source.file}: which labels are the organ? {source.present_text}: give {FORM}")
+        advice = f"give {FORM}" if present else "leave it out"
+        raise MeshError(f"{source.file}: which label is it? {source.present_text}: {advice}")
     return LabelName(region_name(source.file), present[0].value)
 
 

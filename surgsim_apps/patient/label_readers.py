@@ -346,7 +346,7 @@ def _read_itk(file: Path) -> LabelSource:
     stated = _slicer_segments(header, layered=components > 1)
     if components > 1 and not stated:
         raise MeshError(f"{file}: each voxel has {components} numbers; the rule is one label: export one layer of it")
-    if max((segment.layer or 0 for segment in stated), default=0) >= components:
+    if not all(0 <= (segment.layer or 0) < components for segment in stated):
         raise MeshError(f"{file}: its segments ({'; '.join(map(str, stated))}) name layers, but it has {components}")
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]

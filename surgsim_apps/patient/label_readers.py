@@ -32,7 +32,7 @@ CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 # Largest distance of frames off the grid, over the slice step, or over 1 mm for thinner slices; and largest difference
 # of two statements of a header about one length, over the voxels' spacing.
 SLACK = 0.02
-# Largest distance of labels in floats from whole numbers: rounding, and no partial volume.
+# Largest distance of labels in floats from whole numbers, and largest relative difference of pixels: rounding.
 ROUNDING = 1e-3
 
 
@@ -437,18 +437,20 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
             f"{file}: its frames have no place in the patient, as of a microscope or an X-ray projection: the rule is "
             "a stack of slices: give a segmentation of CT or MR"
         )
-    turns = {tuple(map(float, plane.ImageOrientationPatient)) for plane in planes}
-    if len(turns) != 1:
+    turns = np.array([plane.ImageOrientationPatient for plane in planes], dtype=float)
+    if np.ptp(turns, axis=0).max() > COSINE_LARGEST:
         raise MeshError(
-            f"{file}: its frames have {len(turns)} orientations; the rule is one stack of parallel slices: resample it"
+            f"{file}: its frames have {len(np.unique(turns, axis=0))} orientations; the rule is one stack of parallel "
+            "slices: resample it"
         )
     measures = [_group(data, frame, "PixelMeasuresSequence") for frame in frames]
-    sizes = {tuple(map(float, measure.PixelSpacing)) for measure in measures}
-    if len(sizes) != 1:
+    sizes = np.array([measure.PixelSpacing for measure in measures], dtype=float)
+    if np.ptp(sizes, axis=0).max() > ROUNDING * sizes.min():
         raise MeshError(
-            f"{file}: its frames have pixels of {len(sizes)} sizes; the rule is one grid: resample it onto one"
+            f"{file}: its frames have pixels of {len(np.unique(sizes, axis=0))} sizes; the rule is one grid: resample "
+            "it onto one"
         )
-    turn = np.array(turns.pop()).reshape(2, 3)
+    turn = turns[0].reshape(2, 3)
     normal = np.cross(turn[0], turn[1])
     places = np.array([position.ImagePositionPatient for position in positions], dtype=float)
     along = matmul(places, normal)
@@ -461,7 +463,7 @@ def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeomet
             f"{file}: a frame lies {off.max():.3g} mm off an even stack of {step:.4g} mm slices: sheared or uneven "
             "stacks and tiles are refused: resample it onto right-angled axes"
         )
-    row_spacing, column_spacing = sizes.pop()
+    row_spacing, column_spacing = sizes[0]
     matrix: FloatArray = np.column_stack([turn[0] * column_spacing, turn[1] * row_spacing, normal * step]) * 1e-3
     return ImageGeometry.from_matrix(matrix, first * 1e-3, file), slices, notes
 

@@ -136,6 +136,19 @@ def test_spacing_of_slices_by_the_frames_and_by_the_header(places, spacing, thic
     assert all(length in image.notes[0] for length in noted)
 
 
+def test_frames_whose_headers_differ_by_rounding(tmp_path):
+    file, labels = segmentation(tmp_path)
+
+    def rounded(data):
+        frame = data.PerFrameFunctionalGroupsSequence[0]
+        frame.PlaneOrientationSequence = pydicom.Sequence([item(ImageOrientationPatient=[1, 1e-7, 0, -1e-7, 1, 0])])
+        measures = item(PixelSpacing=[2.250001, 2.499999], SliceThickness=3.5)
+        frame.PixelMeasuresSequence = pydicom.Sequence([measures])
+
+    image = read_label_image(edited(file, rounded), parse_labels("liver=1,lesion=3"))
+    assert np.count_nonzero(image.tags) == np.count_nonzero(labels)
+
+
 def turned_once(data):
     turn = item(ImageOrientationPatient=[0, 1, 0, -1, 0, 0])
     data.PerFrameFunctionalGroupsSequence[0].PlaneOrientationSequence = pydicom.Sequence([turn])

@@ -20,10 +20,13 @@ class Organ:
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """A label image (nii, nii.gz, nrrd, dcm); or closed surfaces (STL, OBJ, PLY), the organ first, then a file for each
-    region in it, named after the region; or one file of tets (vtu, vtk, msh, mesh)."""
+    """A label image (nii, nii.gz, nrrd, mha, dcm), or several of one grid, the organ first; or closed surfaces (STL,
+    OBJ, PLY), the organ first, then a file for each region in it, named after the region; or one file of tets (vtu,
+    vtk, msh, mesh)."""
     labels: MaybeText = None
-    """NAME=LABEL,...: the labels of an image, or the region tags of tets, the organ first, such as liver=1,lesion=2."""
+    """NAME=LABEL,...: the labels of an image by number or by their names in the file, or the region tags of tets, the
+    organ first, such as liver=1,lesion=2; of several images one each, in their order. Default: the only label of each
+    image, named after its file."""
     cell_data: MaybeText = None
     """Name of the cell data with the tags of tets, for files with several."""
     length_unit: MaybeText = None

@@ -49,8 +49,9 @@ class BrokenSurface:
 
 
 def region_name(file: Path) -> str:
-    """Name of a region: the stem of its file, with underscores for characters outside names."""
-    kept = re.sub(r"[^A-Za-z0-9_ .-]", "_", file.stem)[:40]
+    """Name of a region: the file's name without extensions, with underscores for characters outside names."""
+    stem = re.sub(r"(\.seg)?\.(nii\.gz|[^.]*)$", "", file.name, flags=re.IGNORECASE)
+    kept = re.sub(r"[^A-Za-z0-9_ .-]", "_", stem)[:40]
     return check_name(kept.strip(" .-") or "organ", str(file))
 
 

@@ -83,7 +83,9 @@ def read_tets(
         mesh = read_mesh(file, length_unit=length_unit, cell_data=cell_data)
     notes = [str(entry.message) for entry in caught]
     present = np.unique(mesh.region).tolist()
-    named = dict(mesh.region_names) if not labels else {label.value: label.name for label in labels}
+    named: dict[int | str, str] = (
+        dict(mesh.region_names) if not labels else {label.value: label.name for label in labels}
+    )
     if len(present) == 1 and not labels:
         named = {present[0]: named.get(present[0], region_name(file))}
     nameless = [tag for tag in present if tag not in named]

@@ -35,6 +35,11 @@ def test_options_that_do_not_fit_a_scan(extra, named, tmp_path, refusal):
     assert named in refusal("organ", file, *extra)
 
 
+def test_a_surface_beside_a_scan(tmp_path, refusal):
+    file = scan(tmp_path / "ct.nii.gz", spacing=(4.0, 4.0, 4.0))
+    assert "lesion.stl" in refusal("organ", file, ball(tmp_path / "lesion.stl", 9.0))
+
+
 def test_surfaces_of_regions_that_are_no_one_body(tmp_path, refusal):
     """A stone in two parts, of which one would have to be taken; a lesion's surface with a hole; sheets."""
     organ, given = ball(tmp_path / "liver.stl"), ["--length-unit", "mm", "--cell-size", "0.01"]

@@ -92,7 +92,7 @@ def test_tets_of_tag_0_are_outside_unless_named(tmp_path, suffix, name):
     outside = f"{mesh.volumes[tags == 0].sum() * 1e6:.4g} ml"
     assert any(outside in note for note in patient_of_tets(given, 0.01).notes)
     assert any(outside in note for note in surfaces_of_tets(given).notes)
-    named = read_tets(file, "mm", parse_labels("liver=0,stone=1,lesion=2", smallest=0))
+    named = read_tets(file, "mm", parse_labels("liver=0,stone=1,lesion=2", zero_is_outside=False))
     assert named.names == ("liver", "stone", "lesion") and named.volume == pytest.approx(SIDE * SIDE * 0.04)
     with pytest.raises(MeshError, match="0, 2 of 0, 1, 2"):
         read_tets(file, "mm", parse_labels("liver=1"))

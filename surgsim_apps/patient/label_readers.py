@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import arccos, matmul, norm, svd
 from msdm_core.errors import MeshError
 from msdm_core.mesh import FloatArray
-from msdm_core.mesh_files import parsed
+from msdm_core.mesh_files import metres_per_unit, parsed
 
 # The axes of a scan's mesh, in words.
 CONVENTION = "x to the patient's left, y to the back, z to the head (LPS, as DICOM), metres, the scanner's own origin"
@@ -26,6 +26,7 @@ SPACING_RANGE = (1e-5, 0.05)
 AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
 # NIfTI's axes are RAS: x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
+NRRD_SUFFIXES = (".nrrd", ".nhdr")
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
@@ -350,10 +351,11 @@ def _read_itk(file: Path) -> LabelSource:
         raise MeshError(f"{file}: its segments ({'; '.join(map(str, stated))}) name layers, but it has {components}")
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
-    matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
-    geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * 1e-3, file)
+    metres = 1e-3 if file.suffix.lower() not in NRRD_SUFFIXES else _nrrd_unit(file)
+    matrix = direction * np.array(reader.GetSpacing()[:3]) * metres
+    geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * metres, file)
     notes: tuple[str, ...] = ()
-    if file.suffix.lower() in (".nrrd", ".nhdr") and "NRRD_space" not in header:
+    if file.suffix.lower() in NRRD_SUFFIXES and "NRRD_space" not in header:
         notes = ("the header names no anatomical space: left, back and up (LPS) are assumed",)
     # SimpleITK's arrays have the axes reversed, but the layers last.
     values = SimpleITK.GetArrayFromImage(reader.Execute())
@@ -361,6 +363,19 @@ def _read_itk(file: Path) -> LabelSource:
     # RescaleSlope (DICOM PS3.6).
     slope = abs(float(header.get("0028|1053", 0.0)))
     return LabelSource.from_values(file, values, geometry, stated, notes, slope=slope)
+
+
+def _nrrd_unit(file: Path) -> float:
+    """Metres per unit of an NRRD file's space, millimetres if it states none; SimpleITK reads no units."""
+    with file.open("rb") as stream:
+        head = b"".join(iter(lambda: stream.readline().strip(), b""))
+    units = re.search(rb'space units:((?:\s*"[^"]*")+)', head)
+    stated = set(re.findall(r'"([^"]*)"', units[1].decode(errors="replace")) if units else ())
+    if len(stated) > 1:
+        raise MeshError(
+            f"{file}: its axes have the units {', '.join(sorted(stated))}; the rule is one: export it again"
+        )
+    return metres_per_unit(stated.pop()) if stated else 1e-3
 
 
 def _slicer_segments(header: dict[str, str], *, layered: bool) -> tuple[Segment, ...]:

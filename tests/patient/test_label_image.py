@@ -191,6 +191,18 @@ def write_nrrd(path, values, layers, kinds, sizes, segments):
     return path
 
 
+@pytest.mark.parametrize(("units", "spacing"), [('"cm" "cm" "cm"', 0.02), ('"mm" "mm" "mm"', 0.002), ('"m"', 2.0)])
+def test_space_units_of_an_nrrd_file(units, spacing, tmp_path):
+    file = tmp_path / "a.nrrd"
+    write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", f"space units: {units}\n")
+    if spacing > 1.0:
+        refused(file, "2000 x 2000 x 2000 mm")
+    else:
+        assert read_label_image(file).geometry.spacing == pytest.approx(spacing)
+    write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", 'space units: "mm" "cm" "mm"\n')
+    refused(file, "cm, mm")
+
+
 @pytest.mark.parametrize(
     ("numbers", "chosen"), [((1, 1), ("Liver", "Tumour")), ((1, 1), ("Segment0", "Segment_2")), ((1, 2), (1, 2))]
 )

@@ -372,9 +372,7 @@ def _nrrd_unit(file: Path) -> float:
     units = re.search(rb'space units:((?:\s*"[^"]*")+)', head)
     stated = set(re.findall(r'"([^"]*)"', units[1].decode(errors="replace")) if units else ())
     if len(stated) > 1:
-        raise MeshError(
-            f"{file}: its axes have the units {', '.join(sorted(stated))}; the rule is one: export it again"
-        )
+        raise MeshError(f"{file}: its axes have units {', '.join(sorted(stated))}; the rule is one: export it again")
     return metres_per_unit(stated.pop()) if stated else 1e-3
 
 

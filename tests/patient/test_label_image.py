@@ -191,7 +191,9 @@ def write_nrrd(path, values, layers, kinds, sizes, segments):
     return path
 
 
-@pytest.mark.parametrize(("units", "spacing"), [('"cm" "cm" "cm"', 0.02), ('"mm" "mm" "mm"', 0.002), ('"m"', 2.0)])
+@pytest.mark.parametrize(
+    ("units", "spacing"), [('"cm" "cm" "cm"', 0.02), ('"mm" "mm" "mm"', 0.002), ('"m" "m" "m"', 2.0)]
+)
 def test_space_units_of_an_nrrd_file(units, spacing, tmp_path):
     file = tmp_path / "a.nrrd"
     write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", f"space units: {units}\n")

@@ -3,11 +3,14 @@
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.console import Console
 
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.study import RESULT_NAMES, ArmSetup, run_study
+from surgsim_apps.cli.values import MaybePath, MaybeText, SceneName, Text
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.instruments import load_arm
 from surgsim_env.scene import (
@@ -32,22 +35,22 @@ class Arms:
     Writes report.html (self-contained), points.csv, heat maps and a picture (PNG). See docs/arms_report.md.
     """
 
-    left: str
+    left: Text
     """The left arm: a shipped arm's name (psm_grasper, psm_retractor, ...) or a TOML file (docs/arms.md)."""
-    right: str
+    right: Text
     """The right arm, likewise."""
-    ports: Path | None = None
+    ports: MaybePath = None
     """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; default:
     ports as in laparoscopy (docs/arms_report.md)."""
-    scene: str = "liver"
+    scene: SceneName = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
-    compare: tuple[str, ...] = ()
+    compare: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE|ARM ...", help_behavior_hint="")] = ()
     """Other ports files, or arms for both sides, for a ranking."""
     points: int = 500
     """Number of points of the organ."""
     seed: int = 0
     """Seed of the points."""
-    motion: str | None = None
+    motion: MaybeText = None
     """Breathing of the patient: none, calm or free; default: the scene's. Adds reach, paths and clearance through the
     cycle to the report."""
     out: Path = Path("runs/arms")

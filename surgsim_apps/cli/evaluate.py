@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.console import Console
 
 from surgsim_apps.cli.values import MaybePath, MaybeText, missing_packages
@@ -23,7 +25,7 @@ class Evaluate:
     """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
-    compare: tuple[Path, Path] | None = None
+    compare: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="A B", help_behavior_hint="")] = None
     """Result files of two methods on the same episodes."""
     played: ScoringOptions = field(default_factory=ScoringOptions)
 

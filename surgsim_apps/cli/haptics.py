@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeText
+from surgsim_apps.cli.values import MaybeNumber, MaybePath, MaybeText, SceneName
 from surgsim_apps.haptics.device import DeviceDynamics
 from surgsim_apps.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_apps.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
@@ -37,7 +37,7 @@ class Haptics:
     docs/haptics.md describes the packets. Ctrl-C ends it; it then prints rate, lateness and packet counts.
     """
 
-    scene: str = "liver"
+    scene: SceneName = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     motion: MaybeText = None
     """Breathing of the patient: calm, free, or none (holds still); default: the scene's."""
@@ -45,17 +45,17 @@ class Haptics:
     """Hold the breath throughout; without it, the device's second button holds the breath."""
     port: int = PORT
     """UDP port on 127.0.0.1 for poses from the bridge; 0 for a free one."""
-    trajectory: Path | None = None
+    trajectory: MaybePath = None
     """A CSV file with columns time [s], x, y, z [m], instead of a bridge."""
-    device_damping: float | None = None
+    device_damping: MaybeNumber = None
     """Damping of a device with force feedback [N s/m]; without it, the force counts as displayed, not felt."""
     device_mass: float = 0.05
     """Mass of a device with force feedback, at its handle [kg]."""
     device_delay: float = 0.0
     """Delay of pose and force together [s]."""
-    seconds: float | None = None
+    seconds: MaybeNumber = None
     """Duration [s]; default: until Ctrl-C, or the end of the trajectory."""
-    out: Path | None = None
+    out: MaybePath = None
     """Folder for telemetry.csv: time, target, tip, forces, depth and active limits in each haptic step."""
 
     def run(self, console: Console) -> int:

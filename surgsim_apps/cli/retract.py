@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeText
+from surgsim_apps.cli.values import MaybeText, SceneName
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.envs import SurgicalEnv
 from surgsim_env.rendering import NoGLError
@@ -30,7 +30,7 @@ class Retract:
     on failure.
     """
 
-    scene: str = "lobe"
+    scene: SceneName = "lobe"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     instrument: MaybeText = None
     """An arm with a jaw, such as psm_retractor, or a TOML file; default: the scene's own."""

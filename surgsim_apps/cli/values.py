@@ -1,8 +1,10 @@
 """Types of command-line options, parsing of their texts, and default folders of reports."""
 
+import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated
 
@@ -10,31 +12,70 @@ import tyro
 
 from msdm_core.mesh_files import LengthUnit
 
-# Optional values, shown in the help without tyro's "{None}|" and "(default: None)".
+# Powers of ten of the units of lengths [m], longer names first.
+UNITS = {"mm": -3, "cm": -2, "m": 0}
+
+
+def length_of(text: str) -> float:
+    """A length [m] from 5mm, 0.5cm, 0.005m or 0.005.
+
+    Raises:
+        ValueError: a text in another form.
+    """
+    unit = next((unit for unit in UNITS if text.endswith(unit)), "m")
+    try:
+        return float(Decimal(text.removesuffix(unit).strip()).scaleb(UNITS[unit]))
+    except ArithmeticError:
+        raise ValueError(f"{text!r} is no length; give one such as 5mm, 0.5cm or 0.005 (metres)") from None
+
+
+_LENGTH = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="LENGTH",
+    instance_from_str=lambda texts: length_of(texts[0]),
+    is_instance=lambda value: value is None or isinstance(value, float),
+    str_from_instance=lambda value: [str(value)],
+)
+# Texts of options by their form in the help; optional values are shown without a default.
+Text = Annotated[str, tyro.conf.arg(metavar="TEXT")]
+SceneName = Annotated[str, tyro.conf.arg(metavar="SCENE")]
+Length = Annotated[float, _LENGTH]
 MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
+MaybeScene = Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")]
 MaybePath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 MaybeNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_behavior_hint="")]
 MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
+MaybeLength = Annotated[float | None, _LENGTH, tyro.conf.arg(metavar="LENGTH", help_behavior_hint="")]
+Paths = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 # A checkout's root; of an installed package, a folder without pyproject.toml.
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def numbers_of(option: str, text: str, form: str) -> tuple[float, ...]:
-    """The numbers of a list such as 0,0,-1; a ValueError quotes the required form, such as x,y,z."""
+def numbers_of(option: str, text: str, form: str, *, are_lengths: bool = True) -> tuple[float, ...]:
+    """The numbers of a list such as 0,0,-1: lengths, but for a `site` or `ratio`; all finite.
+
+    Raises:
+        ValueError: quotes the required form, such as x,y,z.
+    """
+    names, parts = form.lower().split(","), text.split(",")
     try:
-        numbers = tuple(float(part) for part in text.split(","))
+        numbers = tuple(
+            length_of(part) if are_lengths and name not in ("site", "ratio") else float(part)
+            for name, part in zip(names, parts, strict=True)
+        )
     except ValueError:
         numbers = ()
-    if len(numbers) != len(form.split(",")):
-        raise ValueError(f"{option} is {text!r}; the form is {form}, numbers with commas and no blanks between them")
+    if not (numbers and all(map(math.isfinite, numbers))):
+        units = ", lengths such as 5mm or 0.005 (metres)" if are_lengths else ""
+        raise ValueError(f"{option} is {text!r}; the form is {form}, finite numbers with commas and no blanks{units}")
     return numbers
 
 
-def vector_of(option: str, text: str | None) -> tuple[float, float, float] | None:
+def vector_of(option: str, text: str | None, *, are_lengths: bool = False) -> tuple[float, float, float] | None:
     """The three numbers of an option such as --approach 0,0,-1; None without it."""
     if text is None:
         return None
-    x, y, z = numbers_of(option, text, "x,y,z")
+    x, y, z = numbers_of(option, text, "x,y,z", are_lengths=are_lengths)
     return x, y, z
 
 

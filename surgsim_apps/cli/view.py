@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeText, missing_packages
+from surgsim_apps.cli.values import MaybeNumber, MaybeScene, MaybeText, missing_packages
 from surgsim_env.scene import make_scene, with_instrument, with_motion
 
 # The scene with ports for two arms, and its arms.
@@ -21,9 +21,9 @@ class View:
     Prints the address to open on this machine; other machines use an SSH tunnel. See docs/live.md.
     """
 
-    scene: str | None = None
+    scene: MaybeScene = None
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: liver, lobe for two arms."""
-    instrument: str | None = None
+    instrument: MaybeText = None
     """An arm or a TOML file (docs/arms.md); default: the scene's own."""
     bimanual: bool = False
     """Two arms: a jaw to lift, a ball to touch."""
@@ -33,7 +33,7 @@ class View:
     """Port of 127.0.0.1 to listen on, or the next free one; 0 for any free one."""
     out: Path = Path("runs/live")
     """Folder for recordings."""
-    seconds: float | None = None
+    seconds: MaybeNumber = None
     """Stop after this time [s]."""
 
     def run(self, console: Console) -> int:

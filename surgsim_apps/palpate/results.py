@@ -58,7 +58,7 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
     both = (*palpation.presses, *palpation.model_presses)
     summary = {
         "inputs": dict(inputs),
-        "versions": {"surgsim": _version(), "python": platform.python_version(), "numpy": np.__version__},
+        "versions": {"surgsim": surgsim_version(), "python": platform.pythonsurgsim_version(), "numpy": np.__version__},
         "seed": palpation.seed,
         "organ": {"nodes": mesh.node_count, "tets": mesh.tet_count, "anchored_nodes": len(palpation.anatomy.anchors)},
         "press": {
@@ -136,7 +136,8 @@ def _map_entry(contrast_map: ContrastMap, misses: Sequence[Miss]) -> dict[str, A
     }
 
 
-def _version() -> str:
+def surgsim_version() -> str:
+    """Version of the installed package, or "checkout"."""
     try:
         return version("surgsim")
     except PackageNotFoundError:

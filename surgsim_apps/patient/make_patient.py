@@ -1,6 +1,5 @@
 """Patient's organ from files: mesh and scene, printed summary, files of mesh, scenes and report."""
 
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -35,7 +34,7 @@ from surgsim_apps.patient.report import report_page
 from surgsim_apps.patient.retract_scene import RetractScene, find_retraction
 from surgsim_apps.patient.scene_text import retract_text, scene_text
 from surgsim_apps.patient.tet_files import PatientTets, patient_of_tets, read_tets, surfaces_of_tets
-from surgsim_apps.patient.touch import plan_text, plan_touch
+from surgsim_apps.patient.touch import check_node_count, check_touch, plan_text, plan_touch
 from surgsim_apps.reports.output_folder import OutputFolder, output_folder
 from surgsim_env.palpation import healthy_file, write_healthy_map
 from surgsim_env.scene import load_scene, make_scene, share_text, warn_of_coarse_cells, with_added_mass
@@ -86,8 +85,6 @@ def make_patient(
     if mesher not in MESHERS:
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
     check_options(options)
-    if cell_size is not None and not 0.0 < cell_size < math.inf:
-        raise ValueError(f"cell_size is {cell_size:g}; the rule is a positive length in metres")
     first = files[0]
     if is_image(first):
         if len(files) > 1:
@@ -117,6 +114,7 @@ def make_patient(
         with progress.step(f"reading {first.name}"):
             contents = read_surfaces(files, length_unit, mend=mend)
         name, volume = contents.organ.name, contents.volume
+    check_touch(volume, options, cell_size)
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
     if isinstance(contents, PatientTets):
         touch = replace(
@@ -125,6 +123,7 @@ def make_patient(
         )
     else:
         touch = plan_touch(volume, options, cell_size=cell_size, graded=mesher == MESHERS[0])
+        check_node_count(touch)
     progress.say(plan_text(touch, organ_material(name, options.youngs_modulus).material, approach))
     cells = Cells(touch.cell_size, touch.is_given, touch.coarsening, touch.fine_depth, approach, angle)
     if options.approach is None and touch.coarsening > 1 and _has_lesions(contents):

@@ -4,31 +4,39 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from surgsim_apps.scoring.figures import EVALUATION_SEEDS
 from surgsim_apps.scoring.results import read_seeds
+
+# Optional values, shown in the help without a default.
+MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
+MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
+MaybePath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
 class ScoringOptions:
     """Environment and episodes of a method; without an option they are the method's own."""
 
-    scene: str | None = None
-    """Default: phantom; for a policy, that of its training."""
-    level: str | None = None
+    scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: phantom; for a policy, that of
+    its training."""
+    level: MaybeText = None
     """Default: standard; for a policy, that of its training."""
-    split: str | None = None
+    split: MaybeText = None
     """Of a family of organs: train, validation or test (the default)."""
-    motion: str | None = None
+    motion: MaybeText = None
     """Motion of the patient; default: the scene's."""
     no_tracking: bool = False
     """Presses and oracles go where the surface is at rest, as it moves."""
-    seeds: str | None = None
+    seeds: MaybeText = None
     """FIRST:LAST or A,B,C; default: the evaluation seeds."""
-    episodes: int | None = None
+    episodes: MaybeCount = None
     """Number of episodes: the first of the seeds."""
-    budget: int | None = None
+    budget: MaybeCount = None
     """Presses of an episode, in place of the environment's own."""
     envs: int = 16
     """Environments side by side."""
@@ -36,11 +44,11 @@ class ScoringOptions:
     """Threads that share them."""
     dtype: Literal["float32", "float64"] = "float32"
     """Of the lanes."""
-    env: str | None = None
+    env: MaybeText = None
     """The environment of --agent MODULE:CLASS; default: SurgSim/PalpateSites-v0."""
-    env_arguments: str = "{}"
+    env_arguments: Annotated[str, tyro.conf.arg(metavar="JSON")] = "{}"
     """Of the environment of --agent MODULE:CLASS, as a JSON object."""
-    results: Path | None = None
+    results: MaybePath = None
     """Folder of result files; default: agents/results of a checkout."""
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeLength, MaybePath, MaybeText, vector_of
+from surgsim_apps.cli.values import AnyPath, MaybeLength, MaybePath, MaybeText, vector_of
 from surgsim_apps.palpate.scene_options import require_length
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.step_progress import StepProgress
@@ -76,7 +76,7 @@ class Arm:
 
     action: tyro.conf.Positional[Literal["check"]]
     """The action."""
-    file: tyro.conf.Positional[Path]
+    file: tyro.conf.Positional[AnyPath]
     """MJCF or URDF file of the arm."""
     tip: MaybeText = None
     """Link or site of the tip, or of the tool's mount; default: the end of the longest chain of joints."""

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.study import RESULT_NAMES, ArmSetup, run_study
-from surgsim_apps.cli.values import MaybePath, MaybeText, SceneName, Text
+from surgsim_apps.cli.values import AnyPath, MaybePath, MaybeText, SceneName, Text, shown_path
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.instruments import load_arm
 from surgsim_env.scene import (
@@ -53,18 +53,18 @@ class Arms:
     motion: MaybeText = None
     """Breathing of the patient: none, calm or free; default: the scene's. Adds reach, paths and clearance through the
     cycle to the report."""
-    out: Path = Path("runs/arms")
+    out: AnyPath = Path("runs/arms")
     """Folder for the results."""
 
     @property
     def command_line(self) -> str:
         """The command for the same report, without --out; files outside the working folder by name alone."""
-        words = ["surgsim", "arms", "--scene", _shown(self.scene), "--left", _shown(self.left)]
-        words += ["--right", _shown(self.right)]
+        words = ["surgsim", "arms", "--scene", shown_path(self.scene), "--left", shown_path(self.left)]
+        words += ["--right", shown_path(self.right)]
         if self.ports is not None:
-            words += ["--ports", _shown(self.ports)]
+            words += ["--ports", shown_path(self.ports)]
         if self.compare:
-            words += ["--compare", *map(_shown, self.compare)]
+            words += ["--compare", *map(shown_path, self.compare)]
         counts = ["--points", self.points, "--seed", self.seed]
         if self.motion is not None:
             counts += ["--motion", self.motion]
@@ -128,11 +128,3 @@ def _checked_ports(path: Path | None, anatomy: Anatomy) -> Ports:
     except ValueError as error:
         raise ValueError(f"ports file {path.name}: {error}") from None
     return ports
-
-
-def _shown(source: str | Path) -> str:
-    """A path independent of the machine: relative to the working folder, or its name alone."""
-    path = Path(source)
-    if not path.is_absolute():
-        return path.as_posix()
-    return path.relative_to(Path.cwd()).as_posix() if path.is_relative_to(Path.cwd()) else path.name

@@ -7,8 +7,25 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybePath, MaybeText, missing_packages
+from surgsim_apps.cli.values import AnyPath, MaybeCount, MaybePath, MaybeScene, MaybeText, Text, missing_packages
 from surgsim_apps.scoring.options import ScoringOptions
+
+
+@dataclass(frozen=True)
+class Episodes(ScoringOptions):
+    """Environment and episodes of a method; without an option they are the method's own."""
+
+    # Types of values in the help.
+    scene: MaybeScene = None
+    level: MaybeText = None
+    split: MaybeText = None
+    motion: MaybeText = None
+    seeds: MaybeText = None
+    episodes: MaybeCount = None
+    budget: MaybeCount = None
+    env: MaybeText = None
+    env_arguments: Text = "{}"
+    results: MaybePath = None
 
 
 @dataclass(frozen=True)
@@ -25,9 +42,9 @@ class Evaluate:
     """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
-    compare: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="A B", help_behavior_hint="")] = None
+    compare: Annotated[tuple[AnyPath, AnyPath] | None, tyro.conf.arg(metavar="A B", help_behavior_hint="")] = None
     """Result files of two methods on the same episodes."""
-    played: ScoringOptions = field(default_factory=ScoringOptions)
+    played: Episodes = field(default_factory=Episodes)
 
     def run(self, console: Console) -> int:
         """Play, print and write; returns 0.

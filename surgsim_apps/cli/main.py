@@ -90,7 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     # Invalid input (MeshError and OrganError are ValueErrors) is reported in one line without a traceback.
     except (ValueError, OSError) as error:
-        print(f"surgsim: error: {' '.join(str(error).split())}", file=sys.stderr)
+        # Of the system's errors, the file and its fault.
+        named = isinstance(error, OSError) and error.filename is not None
+        text = f"{error.filename}: {error.strerror}" if named else str(error)
+        print(f"surgsim: error: {' '.join(text.split())}", file=sys.stderr)
         return 2
 
 

@@ -8,7 +8,16 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeLength, MaybeNumber, MaybePath, MaybeText, Paths, command_text, unit_of, vector_of
+from surgsim_apps.cli.values import (
+    MaybeLength,
+    MaybeNumber,
+    MaybePath,
+    MaybeText,
+    Paths,
+    command_text,
+    unit_of,
+    vector_of,
+)
 from surgsim_env.step_progress import StepProgress
 
 

@@ -7,11 +7,28 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeLength, MaybePath, MaybeText, SceneName, numbers_of, vector_of
-from surgsim_apps.palpate.figures import write_stiffness_map
+from surgsim_apps.cli.values import (
+    MaybeLength,
+    MaybePath,
+    MaybeText,
+    SceneName,
+    command_text,
+    numbers_of,
+    shown_path,
+    vector_of,
+)
+from surgsim_apps.palpate.figures import write_organ_picture, write_stiffness_map
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, load_stable_anatomy, run_palpation
-from surgsim_apps.palpate.report import print_report
-from surgsim_apps.palpate.results import CSV_NAME, PICTURE_NAME, SUMMARY_NAME, write_csv, write_summary
+from surgsim_apps.palpate.report import print_report, write_report
+from surgsim_apps.palpate.results import (
+    CSV_NAME,
+    ORGAN_NAME,
+    PICTURE_NAME,
+    REPORT_NAME,
+    SUMMARY_NAME,
+    write_csv,
+    write_summary,
+)
 from surgsim_apps.palpate.scene_options import SceneOptions, check_lengths, with_options
 from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.reports.output_folder import output_folder
@@ -23,7 +40,7 @@ from surgsim_env.step_progress import StepProgress
 class Palpate:
     """Press an organ site by site, map its stiffness, and report the felt lesions.
 
-    Writes report.html (self-contained), palpation.csv, stiffness_map.png and summary.json. A length is 5mm, 0.5cm or
+    Writes report.html (self-contained), tables and pictures. A length is 5mm, 0.5cm or
     0.005 (metres).
     """
 
@@ -57,8 +74,14 @@ class Palpate:
             spacing=self.spacing,
         )
 
+    @property
+    def command_line(self) -> str:
+        """The command for the same report, without --out."""
+        options = {name: value for name, value in vars(self).items() if name != "out"}
+        return command_text(["surgsim", "palpate"], {**options, "scene": shown_path(self.scene)})
+
     def run(self, console: Console) -> int:
-        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the felt lesions.
+        """Palpate, write report, tables and pictures, and print the felt lesions.
 
         Raises:
             ValueError: conflicting options, impossible values, an unreadable scene file.
@@ -66,7 +89,7 @@ class Palpate:
         _check(self)
         around, lesion_options, below = _around(self), _asked_lesions(self), _asked_below(self)
         scene = with_options(make_scene(self.scene), self.options)
-        names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
+        names = (REPORT_NAME, CSV_NAME, SUMMARY_NAME, PICTURE_NAME, ORGAN_NAME)
         default = Path("runs") / f"palpate-{scene.name}"
         with output_folder(self.out or default, names, numbered=self.out is None) as files:
             with StepProgress(console) as progress:
@@ -81,10 +104,13 @@ class Palpate:
                             anatomy.check_inside(lesion)
                     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
                 palpation = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, progress=progress)
-                with progress.step("drawing the map"):
+                with progress.step("drawing the maps"):
                     write_csv(palpation, files / CSV_NAME)
                     write_summary(palpation, files / SUMMARY_NAME, vars(self))
                     write_stiffness_map(palpation, files / PICTURE_NAME)
+                    write_organ_picture(palpation, files / ORGAN_NAME)
+                    pictures = {"maps": files / PICTURE_NAME, "organ": files / ORGAN_NAME}
+                    write_report(palpation, files / REPORT_NAME, **pictures, command=self.command_line)
         print_report(palpation, console)
         console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
         return 0
@@ -137,6 +163,6 @@ def _below_site(anatomy: Anatomy, site: int, depth: float, radius: float, ratio:
     """Centre [m], radius [m] and modulus ratio of a lesion below a site."""
     sites, normals, _ = plan_sites(anatomy)
     if site >= len(sites):
-        raise ValueError(f"--lesion-below {site}: there are {len(sites)} sites, from 0 to {len(sites) - 1}")
+        raise ValueError(f"--lesion-below {site:g}: there are {len(sites)} sites, from 0 to {len(sites) - 1}")
     x, y, z = (sites[site] - depth * normals[site]).tolist()
     return (x, y, z), radius, ratio

@@ -1,6 +1,5 @@
 """Types of command-line options, parsing of their texts, and default folders of reports."""
 
-import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,8 @@ from msdm_core.mesh_files import LengthUnit
 
 # Powers of ten of the units of lengths [m], longer names first.
 UNITS = {"mm": -3, "cm": -2, "m": 0}
+# Of numbers in lists.
+NUMBER_LARGEST = 1e6
 
 
 def length_of(text: str) -> float:
@@ -29,6 +30,24 @@ def length_of(text: str) -> float:
         raise ValueError(f"{text!r} is no length; give one such as 5mm, 0.5cm or 0.005 (metres)") from None
 
 
+def path_of(text: str) -> Path:
+    """A path; an empty one, as of an unset variable of a shell, is refused: it would be the working folder.
+
+    Raises:
+        ValueError: no text.
+    """
+    if not text.strip():
+        raise ValueError("the path is empty; give one, . for the working folder")
+    return Path(text)
+
+
+_PATH = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="PATH",
+    instance_from_str=lambda texts: path_of(texts[0]),
+    is_instance=lambda value: value is None or isinstance(value, Path),
+    str_from_instance=lambda value: [str(value)],
+)
 _LENGTH = tyro.constructors.PrimitiveConstructorSpec(
     nargs=1,
     metavar="LENGTH",
@@ -42,17 +61,18 @@ SceneName = Annotated[str, tyro.conf.arg(metavar="SCENE")]
 Length = Annotated[float, _LENGTH]
 MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
 MaybeScene = Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")]
-MaybePath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+AnyPath = Annotated[Path, _PATH]
+MaybePath = Annotated[Path | None, _PATH, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 MaybeNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_behavior_hint="")]
 MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
 MaybeLength = Annotated[float | None, _LENGTH, tyro.conf.arg(metavar="LENGTH", help_behavior_hint="")]
-Paths = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+Paths = Annotated[tuple[AnyPath, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 # A checkout's root; of an installed package, a folder without pyproject.toml.
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def numbers_of(option: str, text: str, form: str, *, are_lengths: bool = True) -> tuple[float, ...]:
-    """The numbers of a list such as 0,0,-1: lengths, but for a `site` or `ratio`; all finite.
+    """The numbers of a list such as 0,0,-1: lengths, but for a `site` or `ratio`; none is huge.
 
     Raises:
         ValueError: quotes the required form, such as x,y,z.
@@ -65,9 +85,11 @@ def numbers_of(option: str, text: str, form: str, *, are_lengths: bool = True) -
         )
     except ValueError:
         numbers = ()
-    if not (numbers and all(map(math.isfinite, numbers))):
+    if not (numbers and all(abs(number) < NUMBER_LARGEST for number in numbers)):
         units = ", lengths such as 5mm or 0.005 (metres)" if are_lengths else ""
-        raise ValueError(f"{option} is {text!r}; the form is {form}, finite numbers with commas and no blanks{units}")
+        raise ValueError(
+            f"{option} is {text!r}; the form is {form}, numbers below {NUMBER_LARGEST:g} with commas and no blanks{units}"
+        )
     return numbers
 
 
@@ -87,6 +109,14 @@ def unit_of(text: str | None) -> LengthUnit | None:
         return float(text)
     except ValueError:
         return text
+
+
+def shown_path(source: str | Path) -> str:
+    """A path independent of the machine: relative to the working folder, or its name alone."""
+    path = Path(source)
+    if not path.is_absolute():
+        return path.as_posix()
+    return path.relative_to(Path.cwd()).as_posix() if path.is_relative_to(Path.cwd()) else path.name
 
 
 def command_text(words: Sequence[str], options: Mapping[str, object]) -> str:

@@ -8,7 +8,8 @@ import numpy as np
 from msdm_core.arithmetic import matmul
 from surgsim_env.scene import Anatomy, Ball, Scene, Vector
 
-# Most sites of a raster: a day of presses.
+# Least press depth over the tip's radius; most sites of a raster, a day of presses.
+DEPTH_LEAST = 1e-3
 SITES_MOST = 100_000
 
 
@@ -69,7 +70,7 @@ def require_length(option: str, length: float | None, most: float = math.inf, bo
     Raises:
         ValueError: names the option and the value; of metres instead of millimetres it says so.
     """
-    if length is None or 0.0 < length <= most and length < math.inf:
+    if length is None or (0.0 < length <= most and length < math.inf):
         return
     if not 0.0 < length < math.inf:
         raise ValueError(f"{option} is {length:g} m; it must be finite and above 0")
@@ -79,7 +80,7 @@ def require_length(option: str, length: float | None, most: float = math.inf, bo
 
 
 def check_lengths(anatomy: Anatomy, around: Ball | None = None) -> None:
-    """Refuse a press depth, tip, spacing or ball of sites beyond the organ's size, and a spacing with too many sites.
+    """Refuse a press depth, tip, spacing or ball of sites beyond the organ's size or too small.
 
     Raises:
         ValueError: names the option, its value and the organ's length.
@@ -87,6 +88,9 @@ def check_lengths(anatomy: Anatomy, around: Ball | None = None) -> None:
     scene, points = anatomy.scene, anatomy.mesh.points
     side, thickness = float(np.ptp(points, axis=0).max()), float(np.ptp(matmul(points, anatomy.face.approach)))
     require_length("--press-depth", scene.palpation.press_depth, thickness, "the organ along the approach")
+    least, depth = DEPTH_LEAST * scene.instrument.tip_radius, scene.palpation.press_depth
+    if depth < least:
+        raise ValueError(f"--press-depth is {depth:g} m; the rule is at least {least:g} m with this tip")
     require_length("the tip radius", scene.instrument.tip_radius, side, "the organ's longest side")
     require_length("--around", around.radius if around else None, side, "the organ's longest side")
     spacing = scene.palpation.site_spacing

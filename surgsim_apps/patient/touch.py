@@ -124,8 +124,8 @@ def check_node_count(plan: TouchPlan) -> None:
     """
     if plan.node_count > NODES_MOST:
         raise ValueError(
-            f"cells of {plan.cell_size * 1e3:.3g} mm give about {plan.node_count} nodes; the rule is at most {NODES_MOST}: "
-            "give a larger --cell-size, or a larger --tip-radius or --press-depth, from which it follows"
+            f"cells of {plan.cell_size * 1e3:.3g} mm give about {plan.node_count} nodes; the rule is at most "
+            f"{NODES_MOST}: give a larger --cell-size, or a larger --tip-radius or --press-depth, from which it follows"
         )
 
 

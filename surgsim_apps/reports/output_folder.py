@@ -1,6 +1,7 @@
 """Results of a command, written into a temporary folder beside their places and renamed at the end."""
 
 import contextlib
+import errno
 import itertools
 import os
 import shutil
@@ -60,7 +61,12 @@ def output_folder(folder: Path, names: Sequence[str] = (), *, numbered: bool = F
     except OSError as error:
         raise OSError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
     try:
-        yield OutputFolder(folder, part)
+        try:
+            yield OutputFolder(folder, part)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            raise OSError(f"--out {folder}: its disk is full; free some space, or choose another folder") from None
         written = [path.relative_to(part) for path in sorted(part.rglob("*")) if path.is_file()]
         for name in written:
             (root / name).parent.mkdir(parents=True, exist_ok=True)

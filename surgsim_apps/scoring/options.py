@@ -4,39 +4,31 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from surgsim_apps.scoring.figures import EVALUATION_SEEDS
 from surgsim_apps.scoring.results import read_seeds
-
-# Optional values, shown in the help without a default.
-MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
-MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
-MaybePath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
 class ScoringOptions:
     """Environment and episodes of a method; without an option they are the method's own."""
 
-    scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: phantom; for a policy, that of
-    its training."""
-    level: MaybeText = None
+    scene: str | None = None
+    """A shipped scene or a scene file (TOML); default: phantom; for a policy, that of its training."""
+    level: str | None = None
     """Default: standard; for a policy, that of its training."""
-    split: MaybeText = None
+    split: str | None = None
     """Of a family of organs: train, validation or test (the default)."""
-    motion: MaybeText = None
+    motion: str | None = None
     """Motion of the patient; default: the scene's."""
     no_tracking: bool = False
     """Presses and oracles go where the surface is at rest, as it moves."""
-    seeds: MaybeText = None
+    seeds: str | None = None
     """FIRST:LAST or A,B,C; default: the evaluation seeds."""
-    episodes: MaybeCount = None
+    episodes: int | None = None
     """Number of episodes: the first of the seeds."""
-    budget: MaybeCount = None
+    budget: int | None = None
     """Presses of an episode, in place of the environment's own."""
     envs: int = 16
     """Environments side by side."""
@@ -44,11 +36,11 @@ class ScoringOptions:
     """Threads that share them."""
     dtype: Literal["float32", "float64"] = "float32"
     """Of the lanes."""
-    env: MaybeText = None
+    env: str | None = None
     """The environment of --agent MODULE:CLASS; default: SurgSim/PalpateSites-v0."""
-    env_arguments: Annotated[str, tyro.conf.arg(metavar="JSON")] = "{}"
+    env_arguments: str = "{}"
     """Of the environment of --agent MODULE:CLASS, as a JSON object."""
-    results: MaybePath = None
+    results: Path | None = None
     """Folder of result files; default: agents/results of a checkout."""
 
     def __post_init__(self) -> None:

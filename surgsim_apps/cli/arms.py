@@ -23,7 +23,7 @@ from surgsim_env.scene import (
     with_motion,
 )
 
-FEWEST_POINTS = 10
+FEWEST_POINTS, MOST_POINTS = 10, 100_000
 # Tables of a ports file; any other file of --compare is an arm.
 PORT_TABLES = {"left", "right", "endoscope"}
 
@@ -79,6 +79,8 @@ class Arms:
         for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
+        if self.points > MOST_POINTS:
+            raise ValueError(f"--points is {self.points}; it must be at most {MOST_POINTS}")
         anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
         with output_folder(self.out, RESULT_NAMES) as files:

@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from surgsim_apps.cli.values import AnyPath, MaybeCount, MaybePath, MaybeScene, MaybeText, Text, missing_packages
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.options import ScoringOptions
 
 
@@ -52,7 +53,9 @@ class Evaluate:
         Raises:
             ValueError: not one of the four, an unsuitable option, a missing package, an unknown method.
         """
-        modes = [f"--{name}" for name in ("agent", "policy", "all", "compare") if getattr(self, name)]
+        modes = [
+            f"--{name}" for name in ("agent", "policy", "all", "compare") if getattr(self, name) not in (None, False)
+        ]
         if len(modes) != 1:
             raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {' and '.join(modes) or 'none'}")
         options = self.played
@@ -60,6 +63,9 @@ class Evaluate:
             raise ValueError(
                 "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
             )
+        if options.results is not None:
+            with output_folder(options.results, option="--results"):
+                pass
         from surgsim_apps.scoring import evaluate
 
         with missing_packages("evaluate", "agents"):

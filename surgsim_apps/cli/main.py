@@ -89,10 +89,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("surgsim: stopped", file=sys.stderr)
         return 130
     # Invalid input (MeshError and OrganError are ValueErrors) is reported in one line without a traceback.
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, OverflowError, MemoryError) as error:
         # Of the system's errors, the file and its fault.
         named = isinstance(error, OSError) and error.filename is not None
         text = f"{error.filename}: {error.strerror}" if named else str(error)
+        if isinstance(error, OverflowError | MemoryError):
+            text = f"a number of the options is too large for this computer ({text or 'out of memory'})"
         print(f"surgsim: error: {' '.join(text.split())}", file=sys.stderr)
         return 2
 

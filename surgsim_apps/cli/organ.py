@@ -111,7 +111,7 @@ class Organ:
                 labels=self.labels,
                 length_unit=unit,
                 cell_size=self.cell_size,
-                mesher=self.mesher or patient.MESHERS[0],
+                mesher=patient.MESHERS[0] if self.mesher is None else self.mesher,
                 mend=self.mend,
                 remesh=self.remesh,
                 options=SceneOptions(

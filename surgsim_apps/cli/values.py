@@ -48,6 +48,13 @@ _PATH = tyro.constructors.PrimitiveConstructorSpec(
     is_instance=lambda value: value is None or isinstance(value, Path),
     str_from_instance=lambda value: [str(value)],
 )
+_PATHS = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="FILE ...",
+    instance_from_str=lambda texts: tuple(map(path_of, texts)),
+    is_instance=lambda value: isinstance(value, tuple),
+    str_from_instance=lambda value: [str(path) for path in value],
+)
 _LENGTH = tyro.constructors.PrimitiveConstructorSpec(
     nargs=1,
     metavar="LENGTH",
@@ -66,7 +73,7 @@ MaybePath = Annotated[Path | None, _PATH, tyro.conf.arg(metavar="PATH", help_beh
 MaybeNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_behavior_hint="")]
 MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
 MaybeLength = Annotated[float | None, _LENGTH, tyro.conf.arg(metavar="LENGTH", help_behavior_hint="")]
-Paths = Annotated[tuple[AnyPath, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+Paths = Annotated[tuple[Path, ...], _PATHS, tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 # A checkout's root; of an installed package, a folder without pyproject.toml.
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -88,7 +95,8 @@ def numbers_of(option: str, text: str, form: str, *, are_lengths: bool = True) -
     if not (numbers and all(abs(number) < NUMBER_LARGEST for number in numbers)):
         units = ", lengths such as 5mm or 0.005 (metres)" if are_lengths else ""
         raise ValueError(
-            f"{option} is {text!r}; the form is {form}, numbers below {NUMBER_LARGEST:g} with commas and no blanks{units}"
+            f"{option} is {text!r}; the form is {form}, numbers below {NUMBER_LARGEST:g} with commas and no "
+            f"blanks{units}"
         )
     return numbers
 

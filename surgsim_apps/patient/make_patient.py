@@ -272,6 +272,8 @@ def check_target(out: Path) -> None:
 
     if out.suffix.lower() != WRITTEN_SUFFIX:
         raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; meshes are written as {WRITTEN_SUFFIX}")
+    if out.is_dir():
+        raise ValueError(f"--out {out}: is a folder; give the name of a file")
     folder = next(parent for parent in out.absolute().parents if parent.exists())
     if not (folder.is_dir() and os.access(folder, os.W_OK)):
         raise ValueError(f"--out {out}: {folder} is no folder that you may write to; choose another place")

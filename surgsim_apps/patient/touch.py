@@ -30,6 +30,8 @@ NODES_PER_CELL, FACE_NODES, FACE_SHARE, TETS_PER_NODE = 2.0, 11.5, 1.35, 4.9
 TIME_PER_TET = 9e-9
 # Substeps of an organ with a lesion 8 times as stiff in a haptic step of 1 ms, times cell over sqrt(E / density) [s].
 SUBSTEP_CELLS, HAPTIC_STEP = 10.0, 1e-3
+# Least length over the edge of a cube of the organ's volume.
+LENGTH_LEAST = 1e-3
 # Most nodes of an organ, some 10 GB.
 NODES_MOST = 5_000_000
 # Tip radius of the coarser choice on offer, over that of the plan.
@@ -104,7 +106,7 @@ def plan_touch(volume: float, options: SceneOptions, *, cell_size: float | None,
 
 
 def check_touch(volume: float, options: SceneOptions, cell_size: float | None) -> None:
-    """Refuse lengths that are not above 0, or beyond the edge of a cube of the organ's volume [m^3].
+    """Refuse lengths that are not above 0, below a thousandth of the edge of a cube of the organ's volume, or above it.
 
     Raises:
         ValueError: names the option and its value.
@@ -114,6 +116,11 @@ def check_touch(volume: float, options: SceneOptions, cell_size: float | None) -
     lengths = {"cell-size": cell_size, "tip-radius": options.tip_radius, "press-depth": options.press_depth}
     for option, length in lengths.items():
         require_length(f"--{option}", length, most, "the edge of a cube of the organ's volume")
+        least = max(LENGTH_LEAST * most, 2.0 * CELL_STEP) if volume > 0.0 else 0.0
+        if length is not None and length < least:
+            raise ValueError(
+                f"--{option} is {length:g} m; the rule is at least {least:.2g} m for an organ of this volume"
+            )
 
 
 def check_node_count(plan: TouchPlan) -> None:

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.study import RESULT_NAMES, ArmSetup, run_study
-from surgsim_apps.cli.values import AnyPath, MaybePath, MaybeText, SceneName, Text, shown_path
+from surgsim_apps.cli.values import AnyPath, MaybePath, MaybeText, SceneName, Text, shown_as, shown_path
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.instruments import load_arm
 from surgsim_env.scene import (
@@ -44,7 +43,7 @@ class Arms:
     ports as in laparoscopy (docs/arms_report.md)."""
     scene: SceneName = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
-    compare: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE|ARM ...", help_behavior_hint="")] = ()
+    compare: Annotated[tuple[str, ...], shown_as("FILE|ARM ...")] = ()
     """Other ports files, or arms for both sides, for a ranking."""
     points: int = 500
     """Number of points of the organ."""

@@ -4,10 +4,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import AnyPath, MaybeCount, MaybePath, MaybeScene, MaybeText, Text, missing_packages
+from surgsim_apps.cli.values import (
+    AnyPath,
+    MaybeCount,
+    MaybePath,
+    MaybeScene,
+    MaybeText,
+    Text,
+    missing_packages,
+    shown_as,
+)
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.options import ScoringOptions
 
@@ -43,7 +51,7 @@ class Evaluate:
     """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
-    compare: Annotated[tuple[AnyPath, AnyPath] | None, tyro.conf.arg(metavar="A B", help_behavior_hint="")] = None
+    compare: Annotated[tuple[AnyPath, AnyPath] | None, shown_as("A B")] = None
     """Result files of two methods on the same episodes."""
     played: Episodes = field(default_factory=Episodes)
 

@@ -126,9 +126,10 @@ class Haptics:
                 f"{kept.rate:.1f} haptic steps a second; half began at most {next(late)} late, "
                 f"99 % at most {next(late)}, all at most {next(late)}; {kept.skipped} steps were given up",
                 highlight=False,
+                soft_wrap=True,
             )
             if isinstance(device, UdpDevice):
-                console.print(_packets_text(device.counts), highlight=False)
+                console.print(_packets_text(device.counts), highlight=False, soft_wrap=True)
         return 0
 
 

@@ -89,14 +89,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("surgsim: stopped", file=sys.stderr)
         return 130
     # Invalid input (MeshError and OrganError are ValueErrors) is reported in one line without a traceback.
-    except (ValueError, OSError, OverflowError, MemoryError) as error:
-        # Of the system's errors, the file and its fault.
-        named = isinstance(error, OSError) and error.filename is not None
-        text = f"{error.filename}: {error.strerror}" if named else str(error)
-        if isinstance(error, OverflowError | MemoryError):
-            text = f"a number of the options is too large for this computer ({text or 'out of memory'})"
-        print(f"surgsim: error: {' '.join(text.split())}", file=sys.stderr)
-        return 2
+    except OSError as error:
+        text = str(error) if error.filename is None else f"{error.filename}: {error.strerror}"
+    except ValueError as error:
+        text = str(error)
+    except (OverflowError, MemoryError) as error:
+        text = f"a number of the options is too large for this computer ({error})"
+    print(f"surgsim: error: {' '.join(text.split())}", file=sys.stderr)
+    return 2
 
 
 def _run(arguments: Sequence[str]) -> int:

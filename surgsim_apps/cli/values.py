@@ -1,7 +1,7 @@
 """Types of command-line options, parsing of their texts, and default folders of reports."""
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from pathlib import Path
@@ -41,39 +41,33 @@ def path_of(text: str) -> Path:
     return Path(text)
 
 
-_PATH = tyro.constructors.PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="PATH",
-    instance_from_str=lambda texts: path_of(texts[0]),
-    is_instance=lambda value: value is None or isinstance(value, Path),
-    str_from_instance=lambda value: [str(value)],
-)
-_PATHS = tyro.constructors.PrimitiveConstructorSpec(
-    nargs="*",
-    metavar="FILE ...",
-    instance_from_str=lambda texts: tuple(map(path_of, texts)),
-    is_instance=lambda value: isinstance(value, tuple),
-    str_from_instance=lambda value: [str(path) for path in value],
-)
-_LENGTH = tyro.constructors.PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="LENGTH",
-    instance_from_str=lambda texts: length_of(texts[0]),
-    is_instance=lambda value: value is None or isinstance(value, float),
-    str_from_instance=lambda value: [str(value)],
-)
-# Texts of options by their form in the help; optional values are shown without a default.
+def _parsed(metavar: str, parse: Callable[[str], object]) -> object:
+    """Mark of a type whose values a function reads from one text."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda texts: parse(texts[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def shown_as(metavar: str) -> object:
+    """Mark of an option that is shown without a default."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
 Text = Annotated[str, tyro.conf.arg(metavar="TEXT")]
 SceneName = Annotated[str, tyro.conf.arg(metavar="SCENE")]
-Length = Annotated[float, _LENGTH]
-MaybeText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
-MaybeScene = Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")]
-AnyPath = Annotated[Path, _PATH]
-MaybePath = Annotated[Path | None, _PATH, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-MaybeNumber = Annotated[float | None, tyro.conf.arg(metavar="NUMBER", help_behavior_hint="")]
-MaybeCount = Annotated[int | None, tyro.conf.arg(metavar="COUNT", help_behavior_hint="")]
-MaybeLength = Annotated[float | None, _LENGTH, tyro.conf.arg(metavar="LENGTH", help_behavior_hint="")]
-Paths = Annotated[tuple[Path, ...], _PATHS, tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+Length = Annotated[float, _parsed("LENGTH", length_of)]
+AnyPath = Annotated[Path, _parsed("PATH", path_of)]
+Paths = Annotated[tuple[AnyPath, ...], shown_as("FILE ...")]
+MaybeText = Annotated[str | None, shown_as("TEXT")]
+MaybeScene = Annotated[str | None, shown_as("SCENE")]
+MaybeNumber = Annotated[float | None, shown_as("NUMBER")]
+MaybeCount = Annotated[int | None, shown_as("COUNT")]
+MaybePath = Annotated[Path | None, _parsed("PATH", path_of), shown_as("PATH")]
+MaybeLength = Annotated[float | None, _parsed("LENGTH", length_of), shown_as("LENGTH")]
 # A checkout's root; of an installed package, a folder without pyproject.toml.
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from msdm_core.arithmetic import norm
 from surgsim_apps.palpate.contrast_map import ContrastMap, LesionScore
 from surgsim_apps.palpate.hold import place_text
 from surgsim_apps.palpate.palpation import MODEL, MODEL_SITE_ERROR, PalpationResult
@@ -91,13 +92,9 @@ def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: P
 
 
 def _sentence(contrast_map: ContrastMap) -> str:
-    """Lesions felt on a map, their errors and its false alarms."""
-    errors = [score.error * 1e3 for score in contrast_map.scores if score.felt]
-    off = f", off by {min(errors):.1f} to {max(errors):.1f} mm" if len(errors) > 1 else ""
-    off = f", off by {errors[0]:.1f} mm" if len(errors) == 1 else off
-    alarms = f"{contrast_map.false_alarms or 'no'} false alarm{'' if contrast_map.false_alarms == 1 else 's'}"
-    felt = f"{len(errors)} of {len(contrast_map.scores)} hidden lesions felt" if contrast_map.scores else "none hidden"
-    return f"Against the {contrast_map.name}: {felt}{off}; {alarms}."
+    """The verdict of a map, with the errors of its lesions."""
+    errors = ", ".join(f"{score.error * 1e3:.1f}" for score in contrast_map.scores if score.felt)
+    return f"Against the {_verdict(contrast_map)}{f', errors {errors} mm' if errors else ''}."
 
 
 def _notes(palpation: PalpationResult) -> list[str]:
@@ -110,7 +107,7 @@ def _lesion_rows(palpation: PalpationResult) -> Rows:
     """A row for each lesion: true place, then place, error and contrast on each map."""
     rows = Rows()
     for number, truth in enumerate(palpation.truths):
-        depth = float(np.linalg.norm(truth.point - truth.centre))
+        depth = float(norm(truth.point - truth.centre))
         cells = [_felt_cells(entry, entry.scores[number]) for entry in palpation.maps[::-1]]
         place = f"{depth * 1e3:.1f}", f"{truth.radius * 1e3:.1f}", place_text(truth.point)
         rows.append((truth.name, *place, *itertools.chain(*cells)))

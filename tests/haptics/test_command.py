@@ -28,7 +28,9 @@ def test_trajectory_runs_to_its_end_and_is_written(tmp_path, capsys):
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 601
-    rate, late = re.search(r"([\d.]+) haptic steps a second; late by [\d.]+ ms \(half\), ([\d.]+) ms", output).groups()
+    rate, late = re.search(
+        r"([\d.]+) haptic steps a second; half began at most [\d.]+ ms late, 99 % at most ([\d.]+) ms", output
+    ).groups()
     assert 0.0 < float(rate) < 1010.0
     assert 0.0 < float(late) <= 20.02
     assert float(rows[-1]["depth"]) > 1e-3

@@ -34,7 +34,7 @@ from surgsim_apps.patient.report import report_page
 from surgsim_apps.patient.retract_scene import RetractScene, find_retraction
 from surgsim_apps.patient.scene_text import retract_text, scene_text
 from surgsim_apps.patient.tet_files import PatientTets, patient_of_tets, read_tets, surfaces_of_tets
-from surgsim_apps.patient.touch import check_node_count, check_touch, plan_text, plan_touch
+from surgsim_apps.patient.touch import check_touch, plan_text, plan_touch
 from surgsim_apps.reports.output_folder import OutputFolder, output_folder
 from surgsim_env.palpation import healthy_file, write_healthy_map
 from surgsim_env.scene import load_scene, make_scene, share_text, warn_of_coarse_cells, with_added_mass
@@ -123,7 +123,6 @@ def make_patient(
         )
     else:
         touch = plan_touch(volume, options, cell_size=cell_size, graded=mesher == MESHERS[0])
-        check_node_count(touch)
     progress.say(plan_text(touch, organ_material(name, options.youngs_modulus).material, approach))
     cells = Cells(touch.cell_size, touch.is_given, touch.coarsening, touch.fine_depth, approach, angle)
     if options.approach is None and touch.coarsening > 1 and _has_lesions(contents):

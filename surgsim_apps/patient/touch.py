@@ -32,8 +32,6 @@ TIME_PER_TET = 9e-9
 SUBSTEP_CELLS, HAPTIC_STEP = 10.0, 1e-3
 # Least length over the edge of a cube of the organ's volume.
 LENGTH_LEAST = 1e-3
-# Most nodes of an organ, some 10 GB.
-NODES_MOST = 5_000_000
 # Tip radius of the coarser choice on offer, over that of the plan.
 COARSER = 1.5
 
@@ -116,24 +114,11 @@ def check_touch(volume: float, options: SceneOptions, cell_size: float | None) -
     lengths = {"cell-size": cell_size, "tip-radius": options.tip_radius, "press-depth": options.press_depth}
     for option, length in lengths.items():
         require_length(f"--{option}", length, most, "the edge of a cube of the organ's volume")
-        least = max(LENGTH_LEAST * most, 2.0 * CELL_STEP) if volume > 0.0 else 0.0
+        least = max(LENGTH_LEAST * most, DEPTH_STEP) if volume > 0.0 else 0.0
         if length is not None and length < least:
             raise ValueError(
                 f"--{option} is {length:g} m; the rule is at least {least:.2g} m for an organ of this volume"
             )
-
-
-def check_node_count(plan: TouchPlan) -> None:
-    """Refuse cells too small for a computer's memory.
-
-    Raises:
-        ValueError: names their size and the number of nodes.
-    """
-    if plan.node_count > NODES_MOST:
-        raise ValueError(
-            f"cells of {plan.cell_size * 1e3:.3g} mm give about {plan.node_count} nodes; the rule is at most "
-            f"{NODES_MOST}: give a larger --cell-size, or a larger --tip-radius or --press-depth, from which it follows"
-        )
 
 
 def tip_for_cells(cell_size: float) -> float:

@@ -113,8 +113,9 @@ def field_table(structure: str) -> str:
 
 def command_list() -> str:
     """A table of all commands, then a section each, as Markdown."""
-    (names,) = re.findall(r"^usage: surgsim .*\{([\w,]+)\}", said("--help"), flags=re.MULTILINE)
-    texts = {name: said(name, "--help") for name in names.split(",")}
+    from surgsim_apps.cli.main import EXAMPLES
+
+    texts = {name: said(name, "--help") for name in EXAMPLES}
     rows = [f"| [`{name}`](#surgsim-{name}) | {_first_sentence(text)} |" for name, text in texts.items()]
     return "\n".join(["| command | |", "|---|---|", *rows, "", *(_section(name, text) for name, text in texts.items())])
 
@@ -165,9 +166,7 @@ def _rows(body: str) -> list[tuple[str, str]]:
         elif rows:
             what, help_text = rows[-1]
             rows[-1] = (what, f"{help_text} {content.strip()}".strip())
-    # tyro marks optional values as {None}|PATH ... (default: None).
-    none = re.compile(r"\{None\}\||\s*\(default: (?:None)?\)")
-    return [(none.sub("", what), none.sub("", help_text)) for what, help_text in rows if what != "-h, --help"]
+    return [row for row in rows if row[0] != "-h, --help"]
 
 
 def _first_sentence(text: str) -> str:

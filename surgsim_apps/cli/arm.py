@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeNumber, MaybePath, MaybeText, vector_of
+from surgsim_apps.cli.values import AnyPath, MaybeLength, MaybePath, MaybeText, vector_of
+from surgsim_apps.palpate.scene_options import require_length
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.step_progress import StepProgress
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 # Least share of the places around home in reach of a useful arm's tip.
 REACH_LEAST = 0.5
+# Longest palpator [m].
+TOOL_LONGEST = 1.0
 # Comments on the entries of the written file.
 COMMENTS = {
     "model": "MJCF or URDF file, relative to this file",
@@ -73,14 +76,14 @@ class Arm:
 
     action: tyro.conf.Positional[Literal["check"]]
     """The action."""
-    file: tyro.conf.Positional[Path]
+    file: tyro.conf.Positional[AnyPath]
     """MJCF or URDF file of the arm."""
     tip: MaybeText = None
     """Link or site of the tip, or of the tool's mount; default: the end of the longest chain of joints."""
     trocar: MaybeText = None
-    """Trocar x,y,z in the model's own frame [m]; default: the remote centre, else chosen together with home."""
-    tool: MaybeNumber = None
-    """Mount a straight palpator of this length [m], even beside a shaft; default: 0.4 on arms without a shaft."""
+    """Trocar x,y,z in the model's own frame, lengths; default: the remote centre, else chosen together with home."""
+    tool: MaybeLength = None
+    """Mount a straight palpator of this length, even beside a shaft; default: 400mm on arms without a shaft."""
     out: MaybePath = None
     """Folder for the results; default: that of the file."""
 
@@ -98,6 +101,7 @@ class Arm:
             raise ValueError(f"{self.file} is a xacro file: expand it (xacro {self.file.name} > arm.urdf), check that")
         if self.tool is not None:
             require_number("--tool", self.tool, 0.05, "m")
+            require_length("--tool", self.tool, TOOL_LONGEST, "an instrument")
         folder, stem = self.out or self.file.parent, self.file.stem
         names = f"{stem}.toml", f"{stem}.png"
         if (folder / names[0]).exists():
@@ -106,7 +110,7 @@ class Arm:
             arm_model = find_arm(
                 self.file,
                 tip=self.tip,
-                trocar=vector_of("--trocar", self.trocar),
+                trocar=vector_of("--trocar", self.trocar, are_lengths=True),
                 tool_length=self.tool,
             )
         for sentence in arm_model.notes:

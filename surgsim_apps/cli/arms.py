@@ -3,11 +3,13 @@
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.study import RESULT_NAMES, ArmSetup, run_study
+from surgsim_apps.cli.values import AnyPath, MaybePath, MaybeText, SceneName, Text, shown_as, shown_path
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.instruments import load_arm
 from surgsim_env.scene import (
@@ -20,7 +22,7 @@ from surgsim_env.scene import (
     with_motion,
 )
 
-FEWEST_POINTS = 10
+FEWEST_POINTS, MOST_POINTS = 10, 100_000
 # Tables of a ports file; any other file of --compare is an arm.
 PORT_TABLES = {"left", "right", "endoscope"}
 
@@ -32,36 +34,36 @@ class Arms:
     Writes report.html (self-contained), points.csv, heat maps and a picture (PNG). See docs/arms_report.md.
     """
 
-    left: str
+    left: Text
     """The left arm: a shipped arm's name (psm_grasper, psm_retractor, ...) or a TOML file (docs/arms.md)."""
-    right: str
+    right: Text
     """The right arm, likewise."""
-    ports: Path | None = None
+    ports: MaybePath = None
     """TOML file with tables [left], [right] and [endoscope], each with `point` [m] and `into` or `target`; default:
     ports as in laparoscopy (docs/arms_report.md)."""
-    scene: str = "liver"
+    scene: SceneName = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
-    compare: tuple[str, ...] = ()
+    compare: Annotated[tuple[str, ...], shown_as("FILE|ARM ...")] = ()
     """Other ports files, or arms for both sides, for a ranking."""
     points: int = 500
     """Number of points of the organ."""
     seed: int = 0
     """Seed of the points."""
-    motion: str | None = None
+    motion: MaybeText = None
     """Breathing of the patient: none, calm or free; default: the scene's. Adds reach, paths and clearance through the
     cycle to the report."""
-    out: Path = Path("runs/arms")
+    out: AnyPath = Path("runs/arms")
     """Folder for the results."""
 
     @property
     def command_line(self) -> str:
         """The command for the same report, without --out; files outside the working folder by name alone."""
-        words = ["surgsim", "arms", "--scene", _shown(self.scene), "--left", _shown(self.left)]
-        words += ["--right", _shown(self.right)]
+        words = ["surgsim", "arms", "--scene", shown_path(self.scene), "--left", shown_path(self.left)]
+        words += ["--right", shown_path(self.right)]
         if self.ports is not None:
-            words += ["--ports", _shown(self.ports)]
+            words += ["--ports", shown_path(self.ports)]
         if self.compare:
-            words += ["--compare", *map(_shown, self.compare)]
+            words += ["--compare", *map(shown_path, self.compare)]
         counts = ["--points", self.points, "--seed", self.seed]
         if self.motion is not None:
             counts += ["--motion", self.motion]
@@ -76,6 +78,8 @@ class Arms:
         for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
+        if self.points > MOST_POINTS:
+            raise ValueError(f"--points is {self.points}; it must be at most {MOST_POINTS}")
         anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
         with output_folder(self.out, RESULT_NAMES) as files:
@@ -125,11 +129,3 @@ def _checked_ports(path: Path | None, anatomy: Anatomy) -> Ports:
     except ValueError as error:
         raise ValueError(f"ports file {path.name}: {error}") from None
     return ports
-
-
-def _shown(source: str | Path) -> str:
-    """A path independent of the machine: relative to the working folder, or its name alone."""
-    path = Path(source)
-    if not path.is_absolute():
-        return path.as_posix()
-    return path.relative_to(Path.cwd()).as_posix() if path.is_relative_to(Path.cwd()) else path.name

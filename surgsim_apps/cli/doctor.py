@@ -13,6 +13,8 @@ from typing import Literal
 import numpy as np
 from packaging.requirements import Requirement
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from msdm_core.kernels import advance_substeps
 from msdm_core.numba_cache import FOLDER_PREFIX
@@ -42,31 +44,30 @@ PRESS_FORCE = 0.24889498671636784
 FORCE_TOLERANCE = 1e-6
 
 State = Literal["ok", "missing", "broken"]
+COLOURS: dict[State, str] = {"ok": "green", "missing": "yellow", "broken": "bold red"}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the report: subject, its state and a text."""
+    """A row of the report: subject, its state and a text."""
 
     subject: str
     state: State
     text: str
 
-    def __str__(self) -> str:
-        return f"{self.state:8s} {self.subject}: {self.text}"
-
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check this installation, a line for each part: ok, missing (a feature is not available) or broken."""
+    """Check this installation, a row for each part: ok, missing (a feature is not available) or broken."""
 
     def run(self, console: Console) -> int:
         """Print the findings; returns 1 if a part is broken."""
-        broken = False
-        for finding in findings():
-            console.print(str(finding), highlight=False, soft_wrap=True, markup=False)
-            broken |= finding.state == "broken"
-        return int(broken)
+        rows = list(findings())
+        table = Table("part", "status", "finding", show_lines=True)
+        for finding in rows:
+            table.add_row(finding.subject, Text(finding.state, COLOURS[finding.state]), Text(finding.text))
+        console.print(table)
+        return int(any(finding.state == "broken" for finding in rows))
 
 
 def findings() -> Iterator[Finding]:
@@ -149,7 +150,11 @@ def press() -> Finding:
 
 def packages() -> Iterator[Finding]:
     """Required packages, and missing ones of each extra."""
-    required = [Requirement(text) for text in metadata.requires("surgsim") or []]
+    try:
+        required = [Requirement(text) for text in metadata.requires("surgsim") or []]
+    except metadata.PackageNotFoundError:
+        yield Finding("packages", "missing", "surgsim is not installed, and runs from a checkout: pip install -e .")
+        return
     always = [item for item in required if applies(item, "")]
     wrong = [text for item in always if (text := lack(item))]
     versions = ", ".join(f"{item.name} {metadata.version(item.name)}" for item in always if not lack(item))

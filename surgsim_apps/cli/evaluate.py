@@ -2,11 +2,39 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybePath, MaybeText, missing_packages
+from surgsim_apps.cli.values import (
+    AnyPath,
+    MaybeCount,
+    MaybePath,
+    MaybeScene,
+    MaybeText,
+    Text,
+    missing_packages,
+    shown_as,
+)
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.options import ScoringOptions
+
+
+@dataclass(frozen=True)
+class Episodes(ScoringOptions):
+    """Environment and episodes of a method; without an option they are the method's own."""
+
+    # Types of values in the help.
+    scene: MaybeScene = None
+    level: MaybeText = None
+    split: MaybeText = None
+    motion: MaybeText = None
+    seeds: MaybeText = None
+    episodes: MaybeCount = None
+    budget: MaybeCount = None
+    env: MaybeText = None
+    env_arguments: Text = "{}"
+    results: MaybePath = None
 
 
 @dataclass(frozen=True)
@@ -23,9 +51,9 @@ class Evaluate:
     """A shipped policy by name, or NAME.json with NAME.safetensors beside it."""
     all: bool = False
     """Every search, and every shipped policy for this scene."""
-    compare: tuple[Path, Path] | None = None
+    compare: Annotated[tuple[AnyPath, AnyPath] | None, shown_as("A B")] = None
     """Result files of two methods on the same episodes."""
-    played: ScoringOptions = field(default_factory=ScoringOptions)
+    played: Episodes = field(default_factory=Episodes)
 
     def run(self, console: Console) -> int:
         """Play, print and write; returns 0.
@@ -33,7 +61,9 @@ class Evaluate:
         Raises:
             ValueError: not one of the four, an unsuitable option, a missing package, an unknown method.
         """
-        modes = [f"--{name}" for name in ("agent", "policy", "all", "compare") if getattr(self, name)]
+        modes = [
+            f"--{name}" for name in ("agent", "policy", "all", "compare") if getattr(self, name) not in (None, False)
+        ]
         if len(modes) != 1:
             raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {' and '.join(modes) or 'none'}")
         options = self.played
@@ -41,6 +71,9 @@ class Evaluate:
             raise ValueError(
                 "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
             )
+        if options.results is not None:
+            with output_folder(options.results, option="--results"):
+                pass
         from surgsim_apps.scoring import evaluate
 
         with missing_packages("evaluate", "agents"):

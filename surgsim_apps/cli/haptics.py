@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeText
+from surgsim_apps.cli.values import MaybeNumber, MaybePath, MaybeText, SceneName
 from surgsim_apps.haptics.device import DeviceDynamics
 from surgsim_apps.haptics.loop import HapticLoop, HapticTelemetry
 from surgsim_apps.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
 from surgsim_apps.haptics.settings import BREATH_BIT, HapticSettings
 from surgsim_apps.haptics.trajectory import TrajectoryDevice
-from surgsim_apps.haptics.udp import PORT, UdpDevice
+from surgsim_apps.haptics.udp import PORT, UdpCounts, UdpDevice
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.coupling import Simulation
 from surgsim_env.instruments import parked_place
@@ -27,6 +27,8 @@ from surgsim_env.scene import list_motions, load_anatomy, make_scene, pair_names
 TELEMETRY_NAME = "telemetry.csv"
 VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")
 NUMBERS = ("depth", "share", "energy")
+# Time without a pose until the command says so [s].
+SILENCE = 3.0
 FLAGS = ("fresh", "clamped", "slewed", "approaching", "speed_limited", "workspace_limited")
 
 
@@ -37,7 +39,7 @@ class Haptics:
     docs/haptics.md describes the packets. Ctrl-C ends it; it then prints rate, lateness and packet counts.
     """
 
-    scene: str = "liver"
+    scene: SceneName = "liver"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     motion: MaybeText = None
     """Breathing of the patient: calm, free, or none (holds still); default: the scene's."""
@@ -45,17 +47,17 @@ class Haptics:
     """Hold the breath throughout; without it, the device's second button holds the breath."""
     port: int = PORT
     """UDP port on 127.0.0.1 for poses from the bridge; 0 for a free one."""
-    trajectory: Path | None = None
+    trajectory: MaybePath = None
     """A CSV file with columns time [s], x, y, z [m], instead of a bridge."""
-    device_damping: float | None = None
+    device_damping: MaybeNumber = None
     """Damping of a device with force feedback [N s/m]; without it, the force counts as displayed, not felt."""
-    device_mass: float = 0.05
-    """Mass of a device with force feedback, at its handle [kg]."""
-    device_delay: float = 0.0
-    """Delay of pose and force together [s]."""
-    seconds: float | None = None
+    device_mass: MaybeNumber = None
+    """With --device-damping: mass of the device at its handle [kg]; default: 0.05."""
+    device_delay: MaybeNumber = None
+    """With --device-damping: delay of pose and force together [s]; default: 0."""
+    seconds: MaybeNumber = None
     """Duration [s]; default: until Ctrl-C, or the end of the trajectory."""
-    out: Path | None = None
+    out: MaybePath = None
     """Folder for telemetry.csv: time, target, tip, forces, depth and active limits in each haptic step."""
 
     def run(self, console: Console) -> int:
@@ -84,7 +86,7 @@ class Haptics:
             console.print(f"scene {scene.name}: coupling {coupling.stiffness:.4g} N/m, {coupling.damping:.3g} N s/m")
             if isinstance(device, UdpDevice):
                 host, port = device.address
-                console.print(f"poses to UDP {host}:{port}; Ctrl-C ends")
+                console.print(f"waits for poses at UDP {host}:{port}; Ctrl-C ends", highlight=False)
             # Compiles, or loads compiled code, before the clock runs.
             loop.step()
             loop.reset(tip_position=parked_place(anatomy))
@@ -97,6 +99,7 @@ class Haptics:
             begin = time.perf_counter()
             pacer = Pacer(PaceSettings(simulation.haptic_dt), timing)
             step, a_second = 0, round(1.0 / simulation.haptic_dt)
+            silence = round(SILENCE / simulation.haptic_dt)
             count = None if self.seconds is None else round(self.seconds / simulation.haptic_dt)
             # Ctrl-C ends a run without an end of its own.
             with suppress(KeyboardInterrupt):
@@ -105,7 +108,9 @@ class Haptics:
                     telemetry = loop.step()
                     note(telemetry)
                     step += 1
-                    if step % a_second == 0:
+                    if isinstance(device, UdpDevice) and step % silence == 0 and not device.counts.accepted:
+                        console.print(f"nothing has connected yet{_refused(device.counts)}", highlight=False)
+                    elif step % a_second == 0:
                         tip = telemetry.tip
                         size = float((tip.contact_force @ tip.contact_force) ** 0.5)
                         console.print(f"{telemetry.time:6.1f} s  force {size:.3f} N  depth {tip.depth * 1e3:.2f} mm")
@@ -116,14 +121,36 @@ class Haptics:
                     if count is None and isinstance(device, TrajectoryDevice) and device.over:
                         break
             kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
+            late = (f"{value * 1e3:.2f} ms" for value in (kept.late_p50, kept.late_p99, kept.late_most))
             console.print(
-                f"{kept.rate:.1f} haptic steps a second; late by {kept.late_p50 * 1e3:.2f} ms (half), "
-                f"{kept.late_p99 * 1e3:.2f} ms (99 %), {kept.late_most * 1e3:.2f} ms (all); "
-                f"{kept.skipped} steps given up"
+                f"{kept.rate:.1f} haptic steps a second; half began at most {next(late)} late, "
+                f"99 % at most {next(late)}, all at most {next(late)}; {kept.skipped} steps were given up",
+                highlight=False,
+                soft_wrap=True,
             )
             if isinstance(device, UdpDevice):
-                console.print(f"packets: {device.counts}")
+                console.print(_packets_text(device.counts), highlight=False, soft_wrap=True)
         return 0
+
+
+def _packets_text(counts: UdpCounts) -> str:
+    """Numbers of poses and forces, in a sentence."""
+    if not counts.accepted:
+        return f"Nothing has connected{_refused(counts)}."
+    unsent = f", {counts.unsent} of which the socket refused" if counts.unsent else ""
+    forces = f"{counts.answered + counts.unsent} forces were sent{unsent}"
+    return f"{counts.accepted} poses were received{_refused(counts)}; {forces}."
+
+
+def _refused(counts: UdpCounts) -> str:
+    """Numbers of packets refused, by reason; "" without."""
+    reasons = {
+        "malformed (the format is in docs/haptics.md)": counts.malformed,
+        "old or out of order": counts.stale,
+        "from another sender": counts.stranger,
+    }
+    texts = [f"{count} {reason}" for reason, count in reasons.items() if count]
+    return f", and packets were refused: {', '.join(texts)}" if texts else ""
 
 
 @contextmanager
@@ -139,11 +166,16 @@ def _device(command: Haptics, haptic_step: float) -> Iterator[UdpDevice | Trajec
 
 def _dynamics(command: Haptics) -> DeviceDynamics | None:
     """Dynamics of a device with force feedback."""
+    mass, delay = command.device_mass, command.device_delay
     if command.device_damping is None:
+        if mass is not None or delay is not None:
+            raise ValueError(
+                "--device-mass and --device-delay go with --device-damping, of a device with force feedback"
+            )
         return None
     if command.trajectory is not None:
         raise ValueError("--device-damping: a --trajectory is no device that pushes back; give only one of both")
-    return DeviceDynamics(command.device_damping, command.device_mass, command.device_delay)
+    return DeviceDynamics(command.device_damping, 0.05 if mass is None else mass, delay or 0.0)
 
 
 @contextmanager

@@ -6,7 +6,8 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeNumber, MaybePath, command_text
+from surgsim_apps.cli.values import Length, MaybeLength, MaybePath, Paths, command_text
+from surgsim_apps.palpate.scene_options import require_length
 from surgsim_apps.reports.output_folder import output_folder
 
 
@@ -18,12 +19,12 @@ class Identify:
     (for any scene file), sites.csv, curves.png, modulus_map.png and summary.json. See docs/identify.md.
     """
 
-    recordings: tyro.conf.Positional[tuple[Path, ...]]
+    recordings: tyro.conf.Positional[Paths]
     """CSV files with the columns site, depth_mm, normal_force_n and, if known, x_mm, y_mm, z_mm, time_s; one tissue."""
-    ball_radius: float = 0.00635
-    """Radius of the pressing ball [m]."""
-    thickness: MaybeNumber = None
-    """Thickness of the tissue on its rigid bed [m]; default: searched, with an interval."""
+    ball_radius: Length = 0.00635
+    """Radius of the pressing ball."""
+    thickness: MaybeLength = None
+    """Thickness of the tissue on its rigid bed; default: searched, with an interval."""
     poisson_ratio: float = 0.45
     """Poisson's ratio of the tissue; not identifiable by presses alone."""
     seed: int = 0
@@ -50,6 +51,8 @@ class Identify:
 
         if not self.recordings:
             raise ValueError("give a recording: a CSV file with the columns site, depth_mm, normal_force_n")
+        require_length("--ball-radius", self.ball_radius, 0.1, "the largest ball")
+        require_length("--thickness", self.thickness, 20.0 * self.ball_radius, "20 radii of the ball")
         options = IdentifyOptions(self.ball_radius, self.thickness, self.poisson_ratio, self.seed)
         sets = [read_recording(path) for path in self.recordings]
         default = Path("runs") / f"identify-{sets[0].name}"

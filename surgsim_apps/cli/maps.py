@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
+from surgsim_apps.cli.values import SceneName, Text
 from surgsim_env.palpation import member_map, still_template
 from surgsim_env.scene import MemberName, family_of, make_scene
 
@@ -15,9 +16,9 @@ class Maps:
     An episode with a member without a map in the cache presses it first, in some seconds.
     """
 
-    scene: str = "liver_family"
-    """A family's name, or the path of its scene file."""
-    split: str = "train"
+    scene: SceneName = "liver_family"
+    """A shipped family (see `surgsim scenes`) or the scene file of your own (TOML)."""
+    split: Text = "train"
     """Its part: train, validation or test."""
 
     def run(self, console: Console) -> int:

@@ -3,11 +3,21 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeNumber, MaybePath, MaybeText, command_text, unit_of, vector_of
+from surgsim_apps.cli.values import (
+    MaybeLength,
+    MaybeNumber,
+    MaybePath,
+    MaybeText,
+    Paths,
+    command_text,
+    unit_of,
+    vector_of,
+)
 from surgsim_env.step_progress import StepProgress
 
 
@@ -19,7 +29,7 @@ class Organ:
     of its healthy stiffness, and report.html. See docs/patient.md.
     """
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
+    files: tyro.conf.Positional[Paths]
     """A label image (nii, nii.gz, nrrd, mha, dcm), or several of one grid, the organ first; or closed surfaces (STL,
     OBJ, PLY), the organ first, then a file for each region in it, named after the region; or one file of tets (vtu,
     vtk, msh, mesh)."""
@@ -31,19 +41,19 @@ class Organ:
     """Name of the cell data with the tags of tets, for files with several."""
     length_unit: MaybeText = None
     """Unit of the file: m, cm, mm, or metres per unit as a number; required if the format states none."""
-    cell_size: MaybeNumber = None
-    """Cell size of the organ's lattice [m], the same everywhere; the tip follows from it. Default: cells follow from
+    cell_size: MaybeLength = None
+    """Cell size of the organ's lattice, the same everywhere; the tip follows from it. Default: cells follow from
     the tip, fine at the pressed face and coarse elsewhere."""
-    tip_radius: MaybeNumber = None
-    """Radius of the ball tip [m]; default: 5 mm, or 6 mm for organs above 500 ml, suitable for a trocar of 12 mm."""
-    press_depth: MaybeNumber = None
-    """Depth of a press [m]; default: 7/12 of the tip's radius."""
+    tip_radius: MaybeLength = None
+    """Radius of the ball tip; default: 5 mm, or 6 mm for organs above 500 ml, suitable for a trocar of 12 mm."""
+    press_depth: MaybeLength = None
+    """Depth of a press; default: 7/12 of the tip's radius."""
     out: MaybePath = None
     """File for the mesh, a .vtu."""
     youngs_modulus: MaybeNumber = None
     """Young's modulus of the healthy tissue [Pa]; default: by the organ's name, else the liver's."""
-    modulus: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=PASCAL: Young's modulus of a region; repeatable; default: by its name."""
+    modulus: tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=PASCAL")]] = ()
+    """Young's modulus of a region; default: by its name."""
     approach: MaybeText = None
     """x,y,z: direction of the probe; default: from the front and above in a scan, 0,0,-1 for surfaces."""
     mend: bool = False
@@ -54,8 +64,8 @@ class Organ:
     """lattice (default), or tetwild for conforming region surfaces (extra `tetwild`)."""
 
     healthy_map: bool = True
-    """Press the healthy organ at every site and write the map, for an immediate start of SurgSim/PalpateSites-v0.
-    Without it the first `gym.make` presses these sites."""
+    """Map of the healthy organ, pressed at every site, for SurgSim/PalpateSites-v0; without it the first `gym.make`
+    presses these sites."""
 
     @property
     def command_line(self) -> str:
@@ -107,7 +117,7 @@ class Organ:
                 cell_data=self.cell_data,
                 length_unit=unit,
                 cell_size=self.cell_size,
-                mesher=self.mesher or patient.MESHERS[0],
+                mesher=patient.MESHERS[0] if self.mesher is None else self.mesher,
                 mend=self.mend,
                 remesh=self.remesh,
                 options=SceneOptions(

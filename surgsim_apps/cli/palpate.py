@@ -2,25 +2,37 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 
 from surgsim_apps.cli.values import (
-    MaybeNumber,
+    MaybeLength,
     MaybePath,
     MaybeText,
+    SceneName,
+    command_text,
     numbers_of,
+    shown_path,
     vector_of,
 )
-from surgsim_apps.palpate.figures import write_stiffness_map
+from surgsim_apps.palpate.figures import write_organ_picture, write_stiffness_map
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, load_stable_anatomy, run_palpation
-from surgsim_apps.palpate.report import print_report
-from surgsim_apps.palpate.results import CSV_NAME, PICTURE_NAME, SUMMARY_NAME, write_csv, write_summary
-from surgsim_apps.palpate.scene_options import SceneOptions, with_options
+from surgsim_apps.palpate.report import print_report, write_report
+from surgsim_apps.palpate.results import (
+    CSV_NAME,
+    ORGAN_NAME,
+    PICTURE_NAME,
+    REPORT_NAME,
+    SUMMARY_NAME,
+    write_csv,
+    write_summary,
+)
+from surgsim_apps.palpate.scene_options import SceneOptions, check_lengths, with_options
 from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.scene import Anatomy, Ball, Vector, load_anatomy, load_scene, make_scene
+from surgsim_env.scene import Anatomy, Ball, Vector, load_anatomy, make_scene
 from surgsim_env.step_progress import StepProgress
 
 
@@ -28,27 +40,26 @@ from surgsim_env.step_progress import StepProgress
 class Palpate:
     """Press an organ site by site, map its stiffness, and report the felt lesions.
 
-    Lengths are in metres, forces in newtons. Writes palpation.csv, stiffness_map.png and summary.json.
+    Writes report.html (self-contained), tables and pictures. A length is 5mm, 0.5cm or
+    0.005 (metres).
     """
 
-    scene: MaybeText = None
-    """A shipped scene (see `surgsim scenes`); liver if --organ is not given."""
-    organ: MaybePath = None
-    """Your own scene file (TOML), instead of --scene."""
-    lesion: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """x,y,z,radius,ratio: centre and radius [m], ratio of its modulus to the healthy one; repeatable; replaces the
-    scene's lesions."""
-    lesion_below: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """SITE,DEPTH,RADIUS,RATIO: a lesion below a site of the raster, by its number in palpation.csv; depth of its centre
-    and radius [m], ratio as in --lesion; repeatable, with or without --lesion."""
+    scene: SceneName = "liver"
+    """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
+    lesion: tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="X,Y,Z,RADIUS,RATIO")]] = ()
+    """Lesion in place of the scene's: centre, radius, and ratio of its modulus to the healthy one."""
+    lesion_below: tyro.conf.UseAppendAction[
+        Annotated[tuple[str, ...], tyro.conf.arg(metavar="SITE,DEPTH,RADIUS,RATIO")]
+    ] = ()
+    """Lesion below a site, by its number in palpation.csv, likewise; the depth is that of its centre."""
     approach: MaybeText = None
     """x,y,z: direction of the probe. Default: the scene's."""
     around: MaybeText = None
-    """x,y,z,radius: press only the sites inside this ball [m]; default: the whole palpable face."""
-    press_depth: MaybeNumber = None
-    """Depth of a press [m]; default: the scene's."""
-    spacing: MaybeNumber = None
-    """Distance between sites [m]; default: the scene's."""
+    """x,y,z,radius: press only the sites inside this ball; default: the whole palpable face."""
+    press_depth: MaybeLength = None
+    """Depth of a press; default: the scene's."""
+    spacing: MaybeLength = None
+    """Distance between sites; default: the scene's."""
     out: MaybePath = None
     """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
     seed: int = 0
@@ -63,22 +74,28 @@ class Palpate:
             spacing=self.spacing,
         )
 
+    @property
+    def command_line(self) -> str:
+        """The command for the same report, without --out."""
+        options = {name: value for name, value in vars(self).items() if name != "out"}
+        return command_text(["surgsim", "palpate"], {**options, "scene": shown_path(self.scene)})
+
     def run(self, console: Console) -> int:
-        """Palpate, write palpation.csv, stiffness_map.png and summary.json, and print the felt lesions.
+        """Palpate, write report, tables and pictures, and print the felt lesions.
 
         Raises:
             ValueError: conflicting options, impossible values, an unreadable scene file.
         """
         _check(self)
         around, lesion_options, below = _around(self), _asked_lesions(self), _asked_below(self)
-        scene = load_scene(self.organ) if self.organ else make_scene(self.scene or "liver")
-        scene = with_options(scene, self.options)
-        names = (CSV_NAME, SUMMARY_NAME, PICTURE_NAME)
+        scene = with_options(make_scene(self.scene), self.options)
+        names = (REPORT_NAME, CSV_NAME, SUMMARY_NAME, PICTURE_NAME, ORGAN_NAME)
         default = Path("runs") / f"palpate-{scene.name}"
         with output_folder(self.out or default, names, numbered=self.out is None) as files:
             with StepProgress(console) as progress:
                 with progress.step("preparing the organ"):
                     anatomy = load_anatomy(scene)
+                    check_lengths(anatomy, around)
                     lesions = anatomy.demonstration_lesions()
                     if lesion_options or below:
                         places = [*lesion_options, *(_below_site(anatomy, *lesion) for lesion in below)]
@@ -87,18 +104,19 @@ class Palpate:
                             anatomy.check_inside(lesion)
                     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
                 palpation = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, progress=progress)
-                with progress.step("drawing the map"):
+                with progress.step("drawing the maps"):
                     write_csv(palpation, files / CSV_NAME)
                     write_summary(palpation, files / SUMMARY_NAME, vars(self))
                     write_stiffness_map(palpation, files / PICTURE_NAME)
+                    write_organ_picture(palpation, files / ORGAN_NAME)
+                    pictures = {"maps": files / PICTURE_NAME, "organ": files / ORGAN_NAME}
+                    write_report(palpation, files / REPORT_NAME, **pictures, command=self.command_line)
         print_report(palpation, console)
         console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
         return 0
 
 
 def _check(command: Palpate) -> None:
-    if command.scene is not None and command.organ is not None:
-        raise ValueError("give only one of --scene and --organ")
     if command.seed < 0:
         raise ValueError(f"--seed is {command.seed}; it must be a whole number of at least 0")
 
@@ -145,6 +163,6 @@ def _below_site(anatomy: Anatomy, site: int, depth: float, radius: float, ratio:
     """Centre [m], radius [m] and modulus ratio of a lesion below a site."""
     sites, normals, _ = plan_sites(anatomy)
     if site >= len(sites):
-        raise ValueError(f"--lesion-below {site}: there are {len(sites)} sites, from 0 to {len(sites) - 1}")
+        raise ValueError(f"--lesion-below {site:g}: there are {len(sites)} sites, from 0 to {len(sites) - 1}")
     x, y, z = (sites[site] - depth * normals[site]).tolist()
     return (x, y, z), radius, ratio

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeText
+from surgsim_apps.cli.values import AnyPath, MaybeText, SceneName
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.envs import SurgicalEnv
 from surgsim_env.rendering import NoGLError
@@ -30,7 +30,7 @@ class Retract:
     on failure.
     """
 
-    scene: str = "lobe"
+    scene: SceneName = "lobe"
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML)."""
     instrument: MaybeText = None
     """An arm with a jaw, such as psm_retractor, or a TOML file; default: the scene's own."""
@@ -38,7 +38,7 @@ class Retract:
     """Two arms: the left one lifts the lobe, the right one reaches under it and touches the target."""
     seed: int = 0
     """Seed of the episode."""
-    out: Path = Path("runs/retract")
+    out: AnyPath = Path("runs/retract")
     """Folder for the results."""
 
     def run(self, console: Console) -> int:
@@ -55,8 +55,8 @@ class Retract:
             raise ValueError("--instrument: a bimanual retraction has the two arms of its scene; give only one of both")
         env_id = "SurgSim/BimanualRetract-v0" if self.bimanual else "SurgSim/Retract-v0"
         settings: dict[str, Any] = {} if self.instrument is None else {"instrument": self.instrument}
-        env = gym.make(env_id, scene=self.scene, **settings)
         with output_folder(self.out, NAMES) as files:
+            env = gym.make(env_id, scene=self.scene, **settings)
             env.reset(seed=self.seed)
             before = _pictures(env, console)
             try:

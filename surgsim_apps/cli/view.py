@@ -7,7 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from surgsim_apps.cli.values import MaybeText, missing_packages
+from surgsim_apps.cli.values import AnyPath, MaybeNumber, MaybeScene, MaybeText, missing_packages
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.scene import make_scene, with_instrument, with_motion
 
 # The scene with ports for two arms, and its arms.
@@ -21,9 +22,9 @@ class View:
     Prints the address to open on this machine; other machines use an SSH tunnel. See docs/live.md.
     """
 
-    scene: str | None = None
+    scene: MaybeScene = None
     """A shipped scene (see `surgsim scenes`) or a scene file of your own (TOML); default: liver, lobe for two arms."""
-    instrument: str | None = None
+    instrument: MaybeText = None
     """An arm or a TOML file (docs/arms.md); default: the scene's own."""
     bimanual: bool = False
     """Two arms: a jaw to lift, a ball to touch."""
@@ -31,9 +32,9 @@ class View:
     """Breathing of the patient: calm, free, or none (holds still); default: the scene's."""
     port: int = 8080
     """Port of 127.0.0.1 to listen on, or the next free one; 0 for any free one."""
-    out: Path = Path("runs/live")
+    out: AnyPath = Path("runs/live")
     """Folder for recordings."""
-    seconds: float | None = None
+    seconds: MaybeNumber = None
     """Stop after this time [s]."""
 
     def run(self, console: Console) -> int:
@@ -52,9 +53,15 @@ class View:
             raise ValueError(f"--seconds is {self.seconds}; it must be finite and above 0")
         if not 0 <= self.port <= 65535:
             raise ValueError(f"--port is {self.port}; it must be from 0 (any free one) to 65535")
-        name = self.scene or (BIMANUAL_SCENE if self.bimanual else "liver")
-        instrument = self.instrument or (BIMANUAL_INSTRUMENT if self.bimanual else None)
+        name, instrument = self.scene, self.instrument
+        if name is None:
+            name = BIMANUAL_SCENE if self.bimanual else "liver"
+        if instrument is None and self.bimanual:
+            instrument = BIMANUAL_INSTRUMENT
         scene = with_motion(with_instrument(make_scene(name), instrument), self.motion)
+        # A folder that cannot be written is refused before a recording is lost.
+        with output_folder(self.out):
+            pass
         console.print(f"{scene.name}: meshing, and compiling if that was not done before ...", highlight=False)
         session = Session(scene)
         page = None

@@ -119,7 +119,8 @@ def _reason(
     pressed: tuple[FloatArray, FloatArray],
 ) -> tuple[str, str]:
     truth, (force, bare_force) = score.truth, forces
-    contrast = force / bare_force
+    # A press may slide off, without a force.
+    contrast = force / bare_force if bare_force > 0.0 else 1.0
     (sites, ended_early), spacing, noise = pressed, scene.palpation.site_spacing, scene.sensor.noise
     felt = f"a press feels {force:.3f} N, {bare_force:.3f} N without the lesion (contrast {contrast:.2f})"
     weak = contrast - 1.0 < contrast_map.threshold

@@ -1,12 +1,24 @@
-"""Printed report of a palpation."""
+"""Reports of a palpation: printed, and as a page."""
 
+import itertools
 import math
+import platform
+from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from msdm_core.arithmetic import norm
 from surgsim_apps.palpate.contrast_map import ContrastMap, LesionScore
-from surgsim_apps.palpate.palpation import MODEL, PalpationResult
+from surgsim_apps.palpate.hold import place_text
+from surgsim_apps.palpate.palpation import MODEL, MODEL_SITE_ERROR, PalpationResult
+from surgsim_apps.palpate.results import surgsim_version
+from surgsim_apps.reports.html_page import Picture, render_page
+from surgsim_env.scene import hidden_share
+
+# Cells of a table, the first of which names the row.
+Rows = list[tuple[str, ...]]
 
 
 def print_report(palpation: PalpationResult, console: Console) -> None:
@@ -19,7 +31,7 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
     for entry in palpation.maps:
         # Short enough for a terminal of 80 columns.
         name = "model" if entry.name == MODEL else "neighbours"
-        healthy = "-" if math.isnan(entry.healthy_std) else f"1 ± {entry.healthy_std:.2f} ({entry.healthy_count})"
+        healthy = _healthy_cell(entry)
         for score in entry.scores:
             table.add_row(name, score.truth.name, *_felt_cells(entry, score), healthy)
         if not entry.scores:
@@ -36,11 +48,123 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         for fault in palpation.hold.faults:
             # Markup would take [[anchors]] for a style.
             console.print(f"not held well: {fault}", highlight=False, markup=False)
-    early = int((~palpation.used).sum())
-    console.print(
-        f"{len(palpation.presses)} sites pressed, {early} ended early and left out, {palpation.support_count} not "
-        f"pressed near supports; peak force {max(press.force_peak for press in palpation.presses):.2f} N"
+    console.print(_counts(palpation))
+
+
+def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: Path, command: str) -> None:
+    """Write the report page.
+
+    Args:
+        palpation: its result.
+        path: of the page.
+        maps: PNG file of `write_stiffness_map`.
+        organ: PNG file of `write_organ_picture`.
+        command: the command line that repeats this report.
+    """
+    scene, entries = palpation.anatomy.scene, palpation.maps[::-1]
+    map_caption = (
+        "Left and middle: stiffness over that of the baseline, seen along the probe's approach. Dots are sites, "
+        "squares sites left out, dashed circles the hidden lesions, crosses the felt places with their errors. Right: "
+        "force on the tip over a lesion and over healthy tissue; dashed: at the same site of the pre-operative model."
     )
+    organ_caption = (
+        "The contrast against the pre-operative model as a glow, the sites as dots, and the probe on the place of "
+        "the strongest contrast."
+    )
+    page = render_page(
+        "palpate.html.j2",
+        generator="surgsim palpate",
+        title=f"Palpation of {scene.name}: {scene.description}",
+        verdict=" ".join(map(_sentence, entries)) + f" {_counts(palpation)}.",
+        notes=_notes(palpation),
+        lesions=_lesion_rows(palpation),
+        maps=[
+            (entry.name, f"{entry.felt_count} of {len(entry.scores)}", str(entry.false_alarms), _healthy_cell(entry))
+            for entry in entries
+        ],
+        map_picture=Picture.of_file(maps, "Stiffness, and force over depth", map_caption),
+        organ_picture=Picture.of_file(organ, "The organ with the probe", organ_caption),
+        press=_press_rows(palpation),
+        run=_run_rows(palpation),
+        command=command,
+    )
+    path.write_text(page, encoding="utf-8", newline="\n")
+
+
+def _sentence(contrast_map: ContrastMap) -> str:
+    """The verdict of a map, with the errors of its lesions."""
+    errors = ", ".join(f"{score.error * 1e3:.1f}" for score in contrast_map.scores if score.felt)
+    return f"Against the {_verdict(contrast_map)}{f', errors {errors} mm' if errors else ''}."
+
+
+def _notes(palpation: PalpationResult) -> list[str]:
+    """Reasons of misses, and faults of the organ's hold."""
+    misses = [f"{miss.lesion}, against the {miss.map_name}: {miss.text}." for miss in palpation.misses]
+    return misses + ([] if palpation.hold is None else [f"Not held well: {fault}." for fault in palpation.hold.faults])
+
+
+def _lesion_rows(palpation: PalpationResult) -> Rows:
+    """A row for each lesion: true place, then place, error and contrast on each map."""
+    rows = Rows()
+    for number, truth in enumerate(palpation.truths):
+        depth = float(norm(truth.point - truth.centre))
+        cells = [_felt_cells(entry, entry.scores[number]) for entry in palpation.maps[::-1]]
+        place = f"{depth * 1e3:.1f}", f"{truth.radius * 1e3:.1f}", place_text(truth.point)
+        rows.append((truth.name, *place, *itertools.chain(*cells)))
+    return rows
+
+
+def _press_rows(palpation: PalpationResult) -> Rows:
+    scene, presses = palpation.anatomy.scene, palpation.presses
+    tip, depth = scene.instrument.tip_radius, scene.palpation.press_depth
+    forces = np.array([press.force for press in presses])[palpation.used]
+    share = hidden_share(float(forces.max()), tip, depth, scene.contact.stiffness)
+    loads = [press.load for press in presses]
+    return [
+        ("tip and press", f"ball of {tip * 1e3:g} mm radius, {depth * 1e3:g} mm deep"),
+        ("approach", ", ".join(f"{value:.3g}" for value in scene.instrument.approach)),
+        ("sites", f"{len(presses)}, {scene.palpation.site_spacing * 1e3:g} mm apart"),
+        ("force held at the end", f"{forces.min():.3f} to {forces.max():.3f} N, median {np.median(forces):.3f} N"),
+        ("peak force", f"{max(press.force_peak for press in presses):.3f} N"),
+        ("largest strain and pressure", f"{max(load.strain for load in loads):.2f}, "
+                                        f"{max(load.pressure for load in loads) / 1e3:.1f} kPa"),
+        ("contrast over 1 that contact hides", f"about {share:.1%} at the largest force"),
+        ("hold", "no complete press" if palpation.hold is None else palpation.hold.text),
+    ]  # fmt: skip
+
+
+def _run_rows(palpation: PalpationResult) -> Rows:
+    mesh, scene = palpation.anatomy.mesh, palpation.anatomy.scene
+    material, factor = scene.material, palpation.model_modulus_factor
+    steps = f"{scene.timing.substep_count} substeps in a haptic step of {scene.timing.haptic_step * 1e3:g} ms"
+    return [
+        ("scene", scene.name),
+        ("organ", f"{mesh.node_count} nodes, {mesh.tet_count} tets"),
+        (
+            "healthy tissue",
+            f"Young's modulus {material.youngs_modulus:g} Pa, Poisson's ratio {material.poisson_ratio:g}",
+        ),
+        ("pre-operative model", f"modulus {factor:.3f} of the organ's, sites {MODEL_SITE_ERROR * 1e3:g} mm off"),
+        ("sensor", f"noise {scene.sensor.noise:g} N"),
+        ("time", f"{palpation.simulated_time:.1f} s simulated in {palpation.wall_time:.1f} s; {steps}"),
+        ("seed", str(palpation.seed)),
+        ("versions", f"surgsim {surgsim_version()}, Python {platform.python_version()}, numpy {np.__version__}"),
+    ]
+
+
+def _counts(palpation: PalpationResult) -> str:
+    """Numbers of sites pressed and left out, and the peak force, in a sentence."""
+    return (
+        f"{len(palpation.presses)} sites pressed, {int((~palpation.used).sum())} ended early and left out, "
+        f"{palpation.support_count} not pressed near supports; "
+        f"peak force {max(press.force_peak for press in palpation.presses):.2f} N"
+    )
+
+
+def _healthy_cell(contrast_map: ContrastMap) -> str:
+    if math.isnan(contrast_map.healthy_std):
+        return "-"
+    return f"1 ± {contrast_map.healthy_std:.2f} ({contrast_map.healthy_count})"
 
 
 def _verdict(contrast_map: ContrastMap) -> str:

@@ -17,7 +17,8 @@ from surgsim_apps.palpate.misses import Miss
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, PalpationResult
 from surgsim_env.scene import contact_radius, hidden_share
 
-CSV_NAME, SUMMARY_NAME, PICTURE_NAME = "palpation.csv", "summary.json", "stiffness_map.png"
+CSV_NAME, SUMMARY_NAME, REPORT_NAME = "palpation.csv", "summary.json", "report.html"
+PICTURE_NAME, ORGAN_NAME = "stiffness_map.png", "organ.png"
 COLUMNS = (
     *("site", "x", "y", "z", "normal_x", "normal_y", "normal_z", "depth", "force", "reading", "stiffness"),
     *("contrast_neighbours", "contrast_model", "ended_early"),
@@ -58,7 +59,7 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
     both = (*palpation.presses, *palpation.model_presses)
     summary = {
         "inputs": dict(inputs),
-        "versions": {"surgsim": _version(), "python": platform.python_version(), "numpy": np.__version__},
+        "versions": {"surgsim": surgsim_version(), "python": platform.python_version(), "numpy": np.__version__},
         "seed": palpation.seed,
         "organ": {"nodes": mesh.node_count, "tets": mesh.tet_count, "anchored_nodes": len(palpation.anatomy.anchors)},
         "press": {
@@ -136,7 +137,8 @@ def _map_entry(contrast_map: ContrastMap, misses: Sequence[Miss]) -> dict[str, A
     }
 
 
-def _version() -> str:
+def surgsim_version() -> str:
+    """Version of the installed package, or "checkout"."""
     try:
         return version("surgsim")
     except PackageNotFoundError:

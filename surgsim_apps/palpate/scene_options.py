@@ -3,7 +3,14 @@
 import math
 from dataclasses import dataclass, replace
 
-from surgsim_env.scene import Scene, Vector
+import numpy as np
+
+from msdm_core.arithmetic import matmul
+from surgsim_env.scene import Anatomy, Ball, Scene, Vector
+
+# Least press depth over the tip's radius; most sites of a raster, a day of presses.
+DEPTH_LEAST = 1e-3
+SITES_MOST = 100_000
 
 
 @dataclass(frozen=True)
@@ -50,16 +57,49 @@ def check_options(options: SceneOptions) -> None:
     """Refuse a length or modulus that is not above 0, and a direction without length."""
     if options.approach is not None:
         _direction(options.approach)
-    values = {
-        "press depth": options.press_depth,
-        "tip radius": options.tip_radius,
-        "spacing": options.spacing,
-        "Young's modulus": options.youngs_modulus,
-    }
-    for name, value in values.items():
-        if value is not None and not 0.0 < value < math.inf:
-            unit = "Pa" if "modulus" in name else "metres"
-            raise ValueError(f"{name} is {value:g}; it must be finite and above 0 ({unit})")
+    for name in ("press_depth", "tip_radius", "spacing"):
+        require_length(f"--{name.replace('_', '-')}", getattr(options, name))
+    modulus = options.youngs_modulus
+    if modulus is not None and not 0.0 < modulus < math.inf:
+        raise ValueError(f"--youngs-modulus is {modulus:g} Pa; it must be finite and above 0")
+
+
+def require_length(option: str, length: float | None, most: float = math.inf, body: str = "") -> None:
+    """Refuse a length [m] that is not above 0, not finite, or above `most` [m], that of a body.
+
+    Raises:
+        ValueError: names the option and the value; of metres instead of millimetres it says so.
+    """
+    if length is None or (0.0 < length <= most and length < math.inf):
+        return
+    if not 0.0 < length < math.inf:
+        raise ValueError(f"{option} is {length:g} m; it must be finite and above 0")
+    # A number without its unit.
+    hint = f"; did you mean {length:g}mm?" if length >= 0.1 and length * 1e-3 <= most else ""
+    raise ValueError(f"{option} is {length:g} m; the rule is at most {most:.3g} m, {body}{hint}")
+
+
+def check_lengths(anatomy: Anatomy, around: Ball | None = None) -> None:
+    """Refuse a press depth, tip, spacing or ball of sites beyond the organ's size or too small.
+
+    Raises:
+        ValueError: names the option, its value and the organ's length.
+    """
+    scene, points = anatomy.scene, anatomy.mesh.points
+    side, thickness = float(np.ptp(points, axis=0).max()), float(np.ptp(matmul(points, anatomy.face.approach)))
+    require_length("--press-depth", scene.palpation.press_depth, thickness, "the organ along the approach")
+    least, depth = DEPTH_LEAST * scene.instrument.tip_radius, scene.palpation.press_depth
+    if depth < least:
+        raise ValueError(f"--press-depth is {depth:g} m; the rule is at least {least:g} m with this tip")
+    require_length("the tip radius", scene.instrument.tip_radius, side, "the organ's longest side")
+    require_length("--around", around.radius if around else None, side, "the organ's longest side")
+    spacing = scene.palpation.site_spacing
+    require_length("--spacing", spacing, side, "the organ's longest side")
+    least = side / math.sqrt(SITES_MOST)
+    if spacing < least:
+        raise ValueError(
+            f"--spacing is {spacing:g} m; the rule is at least {least:.2g} m on this organ, some {SITES_MOST} sites"
+        )
 
 
 def _direction(vector: Vector) -> Vector:

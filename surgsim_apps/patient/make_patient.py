@@ -1,6 +1,5 @@
 """Patient's organ from files: mesh and scene, printed summary, files of mesh, scenes and report."""
 
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -35,7 +34,7 @@ from surgsim_apps.patient.report import report_page
 from surgsim_apps.patient.retract_scene import RetractScene, find_retraction
 from surgsim_apps.patient.scene_text import retract_text, scene_text
 from surgsim_apps.patient.tet_files import PatientTets, patient_of_tets, read_tets, surfaces_of_tets
-from surgsim_apps.patient.touch import plan_text, plan_touch
+from surgsim_apps.patient.touch import check_touch, plan_text, plan_touch
 from surgsim_apps.reports.output_folder import OutputFolder, output_folder
 from surgsim_env.palpation import healthy_file, write_healthy_map
 from surgsim_env.scene import load_scene, make_scene, share_text, warn_of_coarse_cells, with_added_mass
@@ -90,8 +89,6 @@ def make_patient(
     if mesher not in MESHERS:
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
     check_options(options)
-    if cell_size is not None and not 0.0 < cell_size < math.inf:
-        raise ValueError(f"cell_size is {cell_size:g}; the rule is a positive length in metres")
     first, source = files[0], ", ".join(file.name for file in files)
     if is_image(first):
         wrong = [file for file in files if not is_image(file)]
@@ -122,6 +119,7 @@ def make_patient(
         with progress.step(f"reading {first.name}"):
             contents = read_surfaces(files, length_unit, mend=mend)
         name, volume = contents.organ.name, contents.volume
+    check_touch(volume, options, cell_size)
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
     if isinstance(contents, PatientTets):
         touch = replace(
@@ -278,6 +276,8 @@ def check_target(out: Path) -> None:
 
     if out.suffix.lower() != WRITTEN_SUFFIX:
         raise ValueError(f"--out {out}: unknown extension {out.suffix!r}; meshes are written as {WRITTEN_SUFFIX}")
+    if out.is_dir():
+        raise ValueError(f"--out {out}: is a folder; give the name of a file")
     folder = next(parent for parent in out.absolute().parents if parent.exists())
     if not (folder.is_dir() and os.access(folder, os.W_OK)):
         raise ValueError(f"--out {out}: {folder} is no folder that you may write to; choose another place")

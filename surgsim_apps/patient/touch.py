@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from msdm_core.arithmetic import cbrt, power
 from msdm_core.material import Material
-from surgsim_apps.palpate.scene_options import SceneOptions
+from surgsim_apps.palpate.scene_options import SceneOptions, require_length
 from surgsim_env.scene import Vector, contact_radius
 
 # Radius of a tip [m] for organs up to these volumes [m^3]: a ball of 10 to 12 mm passes a trocar of 12 mm.
@@ -30,6 +30,8 @@ NODES_PER_CELL, FACE_NODES, FACE_SHARE, TETS_PER_NODE = 2.0, 11.5, 1.35, 4.9
 TIME_PER_TET = 9e-9
 # Substeps of an organ with a lesion 8 times as stiff in a haptic step of 1 ms, times cell over sqrt(E / density) [s].
 SUBSTEP_CELLS, HAPTIC_STEP = 10.0, 1e-3
+# Least length over the edge of a cube of the organ's volume.
+LENGTH_LEAST = 1e-3
 # Tip radius of the coarser choice on offer, over that of the plan.
 COARSER = 1.5
 
@@ -99,6 +101,24 @@ def plan_touch(volume: float, options: SceneOptions, *, cell_size: float | None,
     across = float(cbrt(max(volume, 0.0))) / CELLS_ACROSS
     coarsening = next((factor for factor in COARSENINGS if factor * cell <= across), 1) if graded else 1
     return TouchPlan(tip, depth, cell, coarsening, volume, is_given=False)
+
+
+def check_touch(volume: float, options: SceneOptions, cell_size: float | None) -> None:
+    """Refuse lengths that are not above 0, below a thousandth of the edge of a cube of the organ's volume, or above it.
+
+    Raises:
+        ValueError: names the option and its value.
+    """
+    # A broken surface may enclose nothing; its mesher refuses it.
+    most = float(cbrt(volume)) if volume > 0.0 else math.inf
+    lengths = {"cell-size": cell_size, "tip-radius": options.tip_radius, "press-depth": options.press_depth}
+    for option, length in lengths.items():
+        require_length(f"--{option}", length, most, "the edge of a cube of the organ's volume")
+        least = max(LENGTH_LEAST * most, DEPTH_STEP) if volume > 0.0 else 0.0
+        if length is not None and length < least:
+            raise ValueError(
+                f"--{option} is {length:g} m; the rule is at least {least:.2g} m for an organ of this volume"
+            )
 
 
 def tip_for_cells(cell_size: float) -> float:

@@ -1,6 +1,7 @@
 """Results of a command, written into a temporary folder beside their places and renamed at the end."""
 
 import contextlib
+import errno
 import itertools
 import os
 import shutil
@@ -39,13 +40,16 @@ class OutputFolder:
 
 
 @contextlib.contextmanager
-def output_folder(folder: Path, names: Sequence[str] = (), *, numbered: bool = False) -> Iterator[OutputFolder]:
+def output_folder(
+    folder: Path, names: Sequence[str] = (), *, numbered: bool = False, option: str = "--out"
+) -> Iterator[OutputFolder]:
     """Folder for results in a `with`: they appear at its end together, after an error none does.
 
     Args:
         folder: of the results; created if necessary.
         names: of all possible results; older files of these names are removed.
         numbered: use the first free FOLDER-NUMBER.
+        option: of the command, for messages.
 
     Raises:
         OSError: the folder or a result cannot be written.
@@ -58,9 +62,14 @@ def output_folder(folder: Path, names: Sequence[str] = (), *, numbered: bool = F
         root.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=PART, dir=root))
     except OSError as error:
-        raise OSError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+        raise OSError(f"{option} {folder}: cannot be written ({error.strerror}); choose another folder") from None
     try:
-        yield OutputFolder(folder, part)
+        try:
+            yield OutputFolder(folder, part)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            raise OSError(f"{option} {folder}: its disk is full; free some space, or choose another folder") from None
         written = [path.relative_to(part) for path in sorted(part.rglob("*")) if path.is_file()]
         for name in written:
             (root / name).parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ class ScoringOptions:
     """Environment and episodes of a method; without an option they are the method's own."""
 
     scene: str | None = None
-    """Default: phantom; for a policy, that of its training."""
+    """A shipped scene or a scene file (TOML); default: phantom; for a policy, that of its training."""
     level: str | None = None
     """Default: standard; for a policy, that of its training."""
     split: str | None = None

@@ -116,6 +116,9 @@ def load_results(folder: Path) -> list[Result]:
     return [load_result(path) for path in sorted(folder.glob("*.json"))]
 
 
+SEEDS_MOST = 1_000_000
+
+
 def read_seeds(text: str) -> tuple[int, ...]:
     """The seeds of "FIRST:LAST", both included, or of a list "A,B,C".
 
@@ -131,6 +134,8 @@ def read_seeds(text: str) -> tuple[int, ...]:
         first, last = map(int, text.split(":"))
         if first > last:
             raise ValueError(f"{rule}; FIRST is at most LAST")
+        if last - first >= SEEDS_MOST:
+            raise ValueError(f"{rule}; at most {SEEDS_MOST} of them")
         return tuple(range(first, last + 1))
     return tuple(map(int, text.split(",")))
 

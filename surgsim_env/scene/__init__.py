@@ -32,6 +32,7 @@ from surgsim_env.scene.load import (
     nearest,
     pair_names,
     read_toml,
+    require_known,
     scenes_folder,
     with_instrument,
 )
@@ -126,6 +127,7 @@ __all__ = [
     "pair_names",
     "read_description",
     "read_toml",
+    "require_known",
     "require_number",
     "scenes_folder",
     "share_text",

@@ -8,8 +8,10 @@ import threading
 import numpy as np
 import pytest
 
+from surgsim_apps.cli.haptics import _packets_text
 from surgsim_apps.cli.main import main
 from surgsim_apps.haptics.pacing import SPIN, Pacer
+from surgsim_apps.haptics.udp import UdpCounts
 from tests.haptics.bench_hand import save_trajectory
 from tests.haptics.test_docs import BRIDGE
 from tests.haptics.udp_link import SharedTime
@@ -26,7 +28,9 @@ def test_trajectory_runs_to_its_end_and_is_written(tmp_path, capsys):
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 601
-    rate, late = re.search(r"([\d.]+) haptic steps a second; late by [\d.]+ ms \(half\), ([\d.]+) ms", output).groups()
+    rate, late = re.search(
+        r"([\d.]+) haptic steps a second; half began at most [\d.]+ ms late, 99 % at most ([\d.]+) ms", output
+    ).groups()
     assert 0.0 < float(rate) < 1010.0
     assert 0.0 < float(late) <= 20.02
     assert float(rows[-1]["depth"]) > 1e-3
@@ -62,7 +66,27 @@ def test_bridge_feels_the_organ(monkeypatch, capsys):
     shared.leave()
     clients[0].join()
     assert max(felt) > 0.2
-    assert int(re.search(r"accepted=(\d+)", capsys.readouterr().out)[1]) > 1900
+    assert int(re.search(r"(\d+) poses were received", capsys.readouterr().out)[1]) > 1900
+
+
+def test_without_a_client_it_says_so(monkeypatch, capsys):
+    monkeypatch.setattr("surgsim_apps.cli.haptics.SILENCE", 0.02)
+    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--seconds", "0.05"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines.count("nothing has connected yet") == 2 and lines[-1] == "Nothing has connected."
+
+
+@pytest.mark.parametrize(
+    ("counts", "numbers"),
+    [
+        ({"accepted": 5, "answered": 4, "unsent": 1}, ["5", "5", "1"]),
+        ({"accepted": 5, "answered": 5, "malformed": 7, "stale": 8, "stranger": 9}, ["5", "7", "8", "9", "5"]),
+        ({"malformed": 7}, ["7"]),
+        ({}, []),
+    ],
+)
+def test_the_end_gives_every_count_in_a_sentence(counts, numbers):
+    assert re.findall(r"\d+", _packets_text(UdpCounts(**counts))) == numbers
 
 
 @pytest.mark.parametrize(
@@ -76,6 +100,8 @@ def test_bridge_feels_the_organ(monkeypatch, capsys):
         (["--device-damping", "1", "--trajectory", "nowhere.csv"], "--device-damping"),
         (["--trajectory", "nowhere.csv"], "nowhere.csv"),
         (["--port", "70000"], "70000"),
+        (["--device-mass", "0.1"], "--device-damping"),
+        (["--device-delay", "0"], "--device-damping"),
     ],
 )
 def test_bad_input_is_one_line(more, named, capsys):

@@ -2,6 +2,7 @@
 
 from importlib import metadata
 
+import pytest
 from packaging.requirements import Requirement
 
 from surgsim_apps.cli import doctor
@@ -10,9 +11,15 @@ from surgsim_env.rendering import gl
 
 
 def states(capsys):
-    """The state of each subject of a run that just ended, and its text."""
-    lines = capsys.readouterr().out.splitlines()
-    return {line[9:].partition(":")[0]: (line[:8].strip(), line) for line in lines}
+    """The state of each subject of a run that just ended, and its text, from its table."""
+    rows = [line.strip("│").split("│") for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    return {subject.strip(): (state.strip(), text.strip()) for subject, state, text in rows}
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """A terminal of rows that are one line each."""
+    monkeypatch.setenv("COLUMNS", "1000")
 
 
 def test_this_installation_is_sound(capsys):
@@ -46,7 +53,7 @@ def test_a_check_that_fails_is_broken_and_the_others_go_on(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "press", fails)
     assert main(["doctor"]) == 1
     report = states(capsys)
-    assert report["fails"][1] == "broken   fails: RuntimeError: no such thing" and "packages" in report
+    assert report["fails"] == ("broken", "RuntimeError: no such thing") and "packages" in report
 
 
 def test_packages_that_are_absent_or_of_another_version(monkeypatch):
@@ -59,6 +66,15 @@ def test_packages_that_are_absent_or_of_another_version(monkeypatch):
     assert report["packages"].state == "broken" and "numpy is" in report["packages"].text
     assert report["live"].state == "missing" and "pip install 'surgsim[live]'" in report["live"].text
     assert report["video"].state == "ok"
+
+
+def test_a_checkout_without_an_installation_is_a_row(monkeypatch):
+    def absent(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "requires", absent)
+    (row,) = doctor.packages()
+    assert (row.subject, row.state) == ("packages", "missing") and "pip install -e" in row.text
 
 
 def test_no_opengl_and_no_cache_are_missing_features(monkeypatch):

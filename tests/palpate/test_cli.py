@@ -36,7 +36,8 @@ def summary(run):
 
 
 def test_files(run, rows):
-    assert {path.name for path in run.iterdir()} == {"palpation.csv", "summary.json", "stiffness_map.png"}
+    pictures = {"stiffness_map.png", "organ.png"}
+    assert {path.name for path in run.iterdir()} == {"report.html", "palpation.csv", "summary.json"} | pictures
     assert tuple(rows[0]) == COLUMNS
     picture = imread(run / "stiffness_map.png")
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
@@ -81,6 +82,17 @@ def test_summary_gives_the_truth_and_the_error(summary):
     assert lesion["error_mm"] == pytest.approx(1e3 * np.linalg.norm(place - truth["surface_point_m"]), abs=0.1)
     assert lesion["error_mm"] < 8.0
     assert lesion["contrast"] > 1.0 + 4.0 * entry["healthy_std"]
+
+
+def test_the_report_has_the_lesion_with_its_error_and_loads_nothing(run, summary):
+    text = (run / "report.html").read_text(encoding="utf-8")
+    entry = summary["maps"]["pre-operative model"]
+    (lesion,), (truth,) = entry["lesions"], summary["truth"]
+    for place in (entry["estimates"][lesion["estimate"]]["point_m"], truth["surface_point_m"]):
+        assert ", ".join(f"{1e3 * value:.1f}" for value in place) in text
+    assert f">{lesion['error_mm']:.1f}<" in text and f">{lesion['contrast']:.2f}<" in text
+    assert text.count('<img src="data:image/png;base64,') == text.count("<img") == 2
+    assert "surgsim palpate --scene phantom --spacing 0.008 --seed 7" in text and str(run) not in text
 
 
 def test_the_lesion_raises_the_stiffness_above_it(rows):

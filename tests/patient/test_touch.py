@@ -62,8 +62,8 @@ def test_cells_are_fine_at_the_pressed_face_and_as_many_as_was_said(way, tmp_pat
 @pytest.mark.parametrize(
     ("option", "words"),
     [
-        (["--tip-radius", "0"], "tip radius is 0; it must be finite and above 0"),
-        (["--press-depth", "inf"], "press depth is inf; it must be finite"),
+        (["--tip-radius", "0"], "--tip-radius is 0 m; it must be finite and above 0"),
+        (["--press-depth", "inf"], "--press-depth is inf m; it must be finite"),
         (["--remesh"], "--remesh goes with a file of tets"),
     ],
 )

@@ -131,7 +131,7 @@ def test_from_a_surface_to_lesions_on_a_map(tmp_path, capsys):
     hidden = [
         f"--lesion-below={site},{lesion.depth},{lesion.radius},{LESION_RATIO}" for site in far_apart(anatomy, lesion)
     ]
-    printed = run(capsys, "palpate", "--organ", scene, "--spacing", touch.spacing, *hidden, "--out", out)
+    printed = run(capsys, "palpate", "--scene", scene, "--spacing", touch.spacing, *hidden, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     check_held(summary)
     check_found(summary, 2)
@@ -150,7 +150,7 @@ def test_from_a_scan_with_its_lesions_to_a_map(tmp_path, capsys):
     assert -np.dot(scene.instrument.approach, SPLEEN_CROWN) > 0.7
     assert [anchor.name for anchor in scene.anchors] == ["surrounding fat and wall", "hilum"]
     check_report(out, "spleen")
-    run(capsys, "palpate", "--organ", out / "spleen.toml", "--spacing", SPLEEN.spacing, "--out", out)
+    run(capsys, "palpate", "--scene", out / "spleen.toml", "--spacing", SPLEEN.spacing, "--out", out)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     check_held(summary)
     check_found(summary, 2)

@@ -1,5 +1,7 @@
 """Results of commands appear at the end, and after an error none does."""
 
+import errno
+
 import pytest
 
 from surgsim_apps.reports.output_folder import output_folder
@@ -59,3 +61,8 @@ def test_a_place_that_cannot_be_written_is_named_at_once(tmp_path):
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(OSError, match=r"--out .*file: cannot be written \(File exists\); choose another"):
         output_folder(tmp_path / "file").__enter__()
+
+
+def test_a_full_disk_is_an_error_with_the_folder(tmp_path):
+    with pytest.raises(OSError, match=rf"--out {tmp_path}.*another folder"), output_folder(tmp_path, NAMES):
+        raise OSError(errno.ENOSPC, "No space left on device")

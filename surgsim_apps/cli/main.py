@@ -22,6 +22,7 @@ from surgsim_apps.cli.retract import Retract
 from surgsim_apps.cli.scenes import Scenes
 from surgsim_apps.cli.validate import Validate
 from surgsim_apps.cli.view import View
+from surgsim_apps.reports.output_folder import interrupts
 
 Command = (
     Palpate
@@ -43,7 +44,7 @@ Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (invalid input), 130 (Ctrl-C)."""
+    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (invalid input), 130 (Ctrl-C, SIGTERM)."""
     try:
         command = tyro.cli(
             Command, prog="surgsim", args=arguments, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as ended:
         return 2 if ended.code else 0
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), interrupts():
             warnings.showwarning = _show_warning
             return command.run(Console())
     except KeyboardInterrupt:

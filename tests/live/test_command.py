@@ -49,7 +49,7 @@ def hear_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (None, 0)])
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGHUP, 130), (None, 0)])
 def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how, code):
     script, out = tmp_path / "view.py", tmp_path / "out"
     script.write_text(CHILD)

@@ -78,9 +78,7 @@ class Result:
         name = f"{self.place}_{self.method}.json"
         table = asdict(self)
         table["seeds"] = seeds_text(self.seeds)
-        table["figures"] = {
-            key: [_written(value) for value in astuple(figure)] for key, figure in self.figures.items()
-        }
+        table["figures"] = {key: [_written(value) for value in astuple(figure)] for key, figure in self.figures.items()}
         lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in table.items()]
         with output_folder(folder) as files:
             (files / name).write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")

@@ -92,7 +92,7 @@ def _rows(reader: csv.DictReader, columns: Sequence[str], file_name: str) -> Ite
     for row in reader:
         line = reader.line_num
         if any(row.get(MORE, ())):
-            raise ValueError(f"{file_name}, line {line}: more cells than columns; the rule is decimal points, not commas")
+            raise ValueError(f"{file_name}, line {line}: more cells than columns; decimal commas must be points")
         try:
             numbers = [float(row[name]) for name in columns]
         except (TypeError, ValueError):

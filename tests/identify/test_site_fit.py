@@ -81,4 +81,3 @@ def test_presses_that_no_tissue_has_are_not_used(factors, reason, ball_radius):
     ]
     usable, left_out = sort_out(wrong, ball_radius)
     assert not usable and len(left_out) == 1 and reason in next(iter(left_out))
-

@@ -44,7 +44,7 @@ def test_archives_of_a_checkout_hold_its_tracked_files_alone(tmp_path):
         run([*git, *arguments], cwd=project)
     tracked = set(run([*git, "ls-files"], cwd=project).splitlines())
     (project / ".git" / "info" / "exclude").write_text("mine.toml\n")
-    for place in ("", "scenes", "scenes/organs", "agents/policies", "agents/results", "surgsim_env", "surgsim_apps/new"):
+    for place in ("", "scenes", "scenes/organs", "agents/policies", "agents/results", "surgsim_env/x", "surgsim_apps"):
         (project / place).mkdir(exist_ok=True)
         for name in ("secret.key", ".env", "mine.toml", "new.json", "new.py", "run.log"):
             (project / place / name).write_text("must not ship")
@@ -56,7 +56,9 @@ def test_archives_of_a_checkout_hold_its_tracked_files_alone(tmp_path):
     names = zipfile.ZipFile(wheel).namelist()
     assert names == zipfile.ZipFile(direct).namelist()
     shipped = ("msdm_core/", "surgsim_env/", "surgsim_apps/", "scenes/", "agents/policies/", "agents/results/")
-    assert len([name for name in names if ".dist-info/" not in name]) == sum(map(lambda name: name.startswith(shipped), tracked))
+    assert len([name for name in names if ".dist-info/" not in name]) == sum(
+        name.startswith(shipped) for name in tracked
+    )
 
 
 def test_wheel_says_that_its_packages_are_typed(wheel):

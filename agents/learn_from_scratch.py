@@ -32,7 +32,6 @@ from surgsim_apps.training.touch_features import TouchSummary
 from surgsim_env import VectorEnvForStableBaselines
 
 ENVS, REPEAT = 16, 5
-POLICY = "policy.json"
 # Of each periodic evaluation.
 EPISODES = 48
 # Seeds of training and of its evaluations; scores use seeds from 1,000,000.
@@ -169,14 +168,9 @@ def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = No
 
     Raises:
         ValueError: a folder with a run of another seed.
-        OSError: another run writes there, or it cannot be written.
     """
-    with lone_run(folder / POLICY):
-        return _train(recipe, folder, seed, decisions or recipe.decisions, every)
-
-
-def _train(recipe: Recipe, folder: Path, seed: int, total: int, every: int) -> PPO:
     torch.set_num_threads(1)
+    total = decisions or recipe.decisions
     staged = make_envs(recipe, recipe.stages[0])
     scales = {int(path.stem.split("_")[2]): path for path in folder.glob("checkpoint_vecnormalize_*_steps.pkl")}
     saved = {steps: path for steps in scales if (path := folder / f"checkpoint_{steps}_steps.zip").is_file()}
@@ -209,7 +203,7 @@ def _train(recipe: Recipe, folder: Path, seed: int, total: int, every: int) -> P
         trained_steps=model.num_timesteps,
         seed=seed,
     )
-    save_policy(actor_of(model.policy, recipe.layout, drawn=True), description, folder / POLICY)
+    save_policy(actor_of(model.policy, recipe.layout, drawn=True), description, folder / "policy.json")
     return model
 
 
@@ -223,8 +217,9 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=40_000, help="decisions between evaluations")
     options = parser.parse_args()
     folder = options.out or Path("runs") / f"{options.recipe}-seed{options.seed}"
-    model = train(RECIPES[options.recipe], folder, options.seed, decisions=options.decisions, every=options.every)
-    print(f"{model.num_timesteps} decisions; policy in {folder / POLICY}")
+    with lone_run(folder / "policy.json"):
+        model = train(RECIPES[options.recipe], folder, options.seed, decisions=options.decisions, every=options.every)
+    print(f"{model.num_timesteps} decisions; policy in {folder}/policy.json")
 
 
 if __name__ == "__main__":

@@ -144,7 +144,7 @@ def lone_run(result: Path) -> Iterator[None]:
                 # Another run ended after `open`, and a third may have locked a new file.
                 raise BlockingIOError
         except BlockingIOError:
-            raise OSError(f"{result} is written by another run: end that one, or choose another --out") from None
+            raise OSError(f"{result} is written by another run: end that one, or name another result") from None
         try:
             with _room_in(place.parent):
                 yield

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from msdm_core.mesh import FloatArray
+from msdm_core.mesh_files import checked_content
 
 NEEDED = ("site", "depth_mm", "normal_force_n")
 PLACE = ("x_mm", "y_mm", "z_mm")
@@ -79,13 +80,14 @@ def read_recording(path: Path) -> Recording:
         ValueError: an unreadable file; a column or a number that is missing, wrong or beyond any press, with file,
             line, column, value and rule.
     """
+    checked_content(path)
     try:
         data = path.read_bytes()
         text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
         if "\0" in text:
             raise csv.Error("it has NUL characters, as UTF-16 has")
         # No column's name has one of these.
-        separator = max(",;\t", key=text.partition("\n")[0].count)
+        separator = max(",;\t", key="".join(text.splitlines()[:1]).count)
         reader = csv.reader(StringIO(text, newline=""), delimiter=separator)
         header = [name.strip() for name in next(reader, [])]
         rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]

@@ -33,12 +33,13 @@ def test_what_is_written_is_read(tmp_path):
 @pytest.mark.parametrize("separator", [";", "\t"])
 @pytest.mark.parametrize("mark", [",", "."])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_tables_of_office_programs_are_read(tmp_path, separator, mark, encoding):
+@pytest.mark.parametrize("end", ["\r\n", "\r"])
+def test_tables_of_office_programs_are_read(tmp_path, separator, mark, encoding, end):
     """Other columns may have both commas and points."""
     path = tmp_path / "set.csv"
     lines = ["note,site,depth_mm,normal_force_n", "µ. 1%,4,0%5,0%125", "%,4,1,1%5e-1"]
-    text = "\r\n".join(lines).replace(",", separator).replace("%", mark)
-    path.write_bytes(f"{text}\r\n".encode(encoding))
+    text = end.join(lines).replace(",", separator).replace("%", mark)
+    path.write_bytes(f"{text}{end}".encode(encoding))
     (press,) = read_recording(path).presses
     np.testing.assert_allclose(press.depth, [0.5e-3, 1.0e-3])
     np.testing.assert_allclose(press.force, [0.125, 0.15])

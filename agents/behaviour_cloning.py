@@ -11,6 +11,7 @@ from pathlib import Path
 import minari
 import numpy as np
 
+from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.training.fit import fit
 from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
@@ -23,6 +24,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=policy_path, default=Path("runs/clone.json"), help="the policy, NAME.json")
     parser.add_argument("--updates", type=int, default=5000, help="minibatches of the fit")
     options = parser.parse_args(arguments)
+    with lone_run(options.out):
+        clone(options)
+
+
+def clone(options: argparse.Namespace) -> None:
+    """Clone and save by the options of the command line."""
     dataset = minari.load_dataset(options.dataset)
     if len(dataset.observation_space.shape or ()) != 1:
         raise ValueError(f'the observations are {dataset.observation_space}: record with obs_mode="state"')

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
 
@@ -64,7 +65,8 @@ def write_leaderboard(folder: Path, path: Path) -> None:
         rows = [result for result in results if result.place == place]
         parts.append(_sites(rows) if rows[0].env_id == SITES else _tasks(rows))
     parts.append(_commands(results))
-    path.write_text("\n".join(parts), encoding="utf-8")
+    with output_folder(path.parent) as files:
+        (files / path.name).write_text("\n".join(parts), encoding="utf-8")
 
 
 HEADER = """# Leaderboard

@@ -17,12 +17,13 @@ from typing import Any
 import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_apps.reports.output_folder import lone_run, output_folder
 from surgsim_apps.training.curriculum import RepeatedAction, Stage, StagedRewards
 from surgsim_apps.training.palpate_surrogate import PalpateSurrogate
 from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, save_policy
@@ -98,6 +99,26 @@ RECIPES = {
 }
 
 
+class Checkpoints(BaseCallback):
+    """Writes a checkpoint after some steps and at the end; each appears whole."""
+
+    def __init__(self, folder: Path, steps: int) -> None:
+        super().__init__()
+        self.folder, self.steps = folder, steps
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.steps == 0:
+            self._on_training_end()
+        return True
+
+    def _on_training_end(self) -> None:
+        scales = self.model.get_vec_normalize_env()
+        assert scales is not None
+        with output_folder(self.folder) as files:
+            self.model.save(files / f"checkpoint_{self.num_timesteps}_steps.zip")
+            scales.save(str(files / f"checkpoint_vecnormalize_{self.num_timesteps}_steps.pkl"))
+
+
 class CurriculumCallback(BaseCallback):
     """Begins each stage of a recipe between two rollouts."""
 
@@ -143,16 +164,21 @@ def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = No
         folder: of the run.
         seed: of environments, network and exploration.
         decisions: of the whole run, in place of the recipe's.
-        every: decisions between checkpoints, and between evaluations.
+        every: decisions between evaluations; checkpoints are at least ten in a run.
+
+    Raises:
+        ValueError: a folder with a run of another seed.
     """
     torch.set_num_threads(1)
     total = decisions or recipe.decisions
     staged = make_envs(recipe, recipe.stages[0])
-    saved = sorted(folder.glob("checkpoint_*_steps.zip"), key=lambda path: int(path.stem.split("_")[1]))
+    scales = {int(path.stem.split("_")[2]): path for path in folder.glob("checkpoint_vecnormalize_*_steps.pkl")}
+    saved = {steps: path for steps in scales if (path := folder / f"checkpoint_{steps}_steps.zip").is_file()}
     if saved:
-        steps = saved[-1].stem.split("_")[1]
-        envs = VecNormalize.load(str(folder / f"checkpoint_vecnormalize_{steps}_steps.pkl"), staged)
-        model = PPO.load(saved[-1], env=envs, device="cpu")
+        envs = VecNormalize.load(str(scales[max(saved)]), staged)
+        model = PPO.load(saved[max(saved)], env=envs, device="cpu")
+        if model.seed != seed:
+            raise ValueError(f"{folder} holds a run with seed {model.seed}, not {seed}: choose another --out")
     else:
         envs = VecNormalize(staged, norm_obs=False, gamma=recipe.settings["gamma"])
         model = begin(recipe, envs, seed)
@@ -163,7 +189,7 @@ def train(recipe: Recipe, folder: Path, seed: int, *, decisions: int | None = No
     evaluated.seed(EVALUATION_SEED)
     callbacks = [
         CurriculumCallback(recipe, staged),
-        CheckpointCallback(every // ENVS, str(folder), "checkpoint", save_vecnormalize=True),
+        Checkpoints(folder, max(1, min(every, total // 10) // ENVS)),
         # The search is the policy's random walk: its mean action does not search.
         EvalCallback(*(evaluated, None, None, EPISODES, every // ENVS), log_path=logs, deterministic=False, verbose=0),
     ]
@@ -188,10 +214,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="the run's folder; runs/RECIPE-seedSEED otherwise")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--decisions", type=int, help="in place of the recipe's")
-    parser.add_argument("--every", type=int, default=40_000, help="decisions between checkpoints and evaluations")
+    parser.add_argument("--every", type=int, default=40_000, help="decisions between evaluations")
     options = parser.parse_args()
     folder = options.out or Path("runs") / f"{options.recipe}-seed{options.seed}"
-    model = train(RECIPES[options.recipe], folder, options.seed, decisions=options.decisions, every=options.every)
+    with lone_run(folder / "policy.json"):
+        model = train(RECIPES[options.recipe], folder, options.seed, decisions=options.decisions, every=options.every)
     print(f"{model.num_timesteps} decisions; policy in {folder}/policy.json")
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.expert_organs import DEPTH, expert_actions
 from surgsim_apps.training.face_features import (
     LATE,
@@ -140,6 +141,12 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=12, help="of a fit; the last one has four times as many")
     parser.add_argument("--seed", type=int, default=2_000_000)
     options = parser.parse_args()
+    with lone_run(options.out):
+        learn(options)
+
+
+def learn(options: argparse.Namespace) -> None:
+    """Train by the options of the command line."""
     torch.set_num_threads(1)
     torch.manual_seed(options.seed)
     begin = time.time()

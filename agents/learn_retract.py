@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
 from surgsim_apps.training.fit import fit
 from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
@@ -175,6 +176,12 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=2000, help="minibatches of a fit, twice as many of the last")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    with lone_run(options.out):
+        run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run DAgger by the options of the command line."""
     torch.set_num_threads(1)
     torch.manual_seed(options.seed)
     settings = PICTURES if options.pictures else {}

@@ -15,7 +15,8 @@ costs
 with the lines 5 mm and 3.3 mm, over the first 30 presses. The last term is a smooth share of episodes with an error
 above 5 mm after so many presses: the leaderboard counts the presses until that is a half of them. Without it a search
 leaves lesions at errors of 5 to 9 mm and looks for others, which costs less on average and more in the median. The
-policy of the generation with the least cost on `--check-faces` is kept, faces without a part in the learning.
+policy of the generation with the least cost on `--check-faces` is kept, faces without a part in the learning;
+generation 0 is the upper confidence bound.
 """
 
 import argparse
@@ -35,6 +36,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.figures import ERROR_LINE
 from surgsim_apps.training.acquisition import Acquisition
 from surgsim_apps.training.policy_files import (
@@ -180,7 +182,7 @@ def weighted_sources(paths: Sequence[Path], weights: Sequence[float] | None = No
 def learn(arguments: argparse.Namespace) -> None:
     """Search; print a line after each generation, and write the policy at each new least cost."""
     context, one_thread = get_context("spawn"), {"initializer": torch.set_num_threads, "initargs": (1,)}
-    with ProcessPoolExecutor(arguments.processes, context, **one_thread) as pool:
+    with lone_run(arguments.out), ProcessPoolExecutor(arguments.processes, context, **one_thread) as pool:
         _search(arguments, partial(played, pool=pool, shares=arguments.processes))
 
 
@@ -190,26 +192,26 @@ def _search(arguments: argparse.Namespace, play: Play) -> None:
     evolution = Evolution(arguments.population, arguments.episodes, arguments.seed, sources, arguments.spread, play)
     check, began = range(CHECK_SEED, CHECK_SEED + arguments.check_episodes), time.time()
     env = gym.make(ID, scene="phantom_small").unwrapped
-    least = evolution.cost(evolution.best, check, check_sources)
-    print(f"begins at cost {least:.3f}", flush=True)
-    while evolution.generation < arguments.generations:
-        evolution.step()
+    least = math.inf
+    while True:
         checked = evolution.cost(evolution.best, check, check_sources)
         print(
             f"generation {evolution.generation}: cost {checked:.3f} on {len(check)} other episodes, "
             f"{time.time() - began:.0f} s",
             flush=True,
         )
-        if checked >= least:
-            continue
-        least = checked
-        description = PolicyDescription(
-            env_id=ID,
-            observation=observation_declaration(env),
-            trained_steps=evolution.episode_count,
-            seed=arguments.seed,
-        )
-        save_policy(evolution.best, description, arguments.out)
+        if checked < least:
+            least = checked
+            description = PolicyDescription(
+                env_id=ID,
+                observation=observation_declaration(env),
+                trained_steps=evolution.episode_count,
+                seed=arguments.seed,
+            )
+            save_policy(evolution.best, description, arguments.out)
+        if evolution.generation >= arguments.generations:
+            return
+        evolution.step()
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from agents.envhub.env import NAMES, describe_task
+from surgsim_apps.reports.output_folder import new_folder
 from surgsim_env.envs import PalpateSitesEnv
 from surgsim_env.instruments import SIDES, Pair
 
@@ -25,7 +26,7 @@ PROVENANCE = "meta/surgsim.json"
 def write_dataset(
     folder: Path, env: gym.Env, episodes: Iterable[Any], *, cameras: list[str], recorded: Mapping[str, Any]
 ) -> LeRobotDataset:
-    """Write episodes one by one as a data set in a new folder.
+    """Write episodes one by one as a data set in a new folder, which appears at the end.
 
     Args:
         folder: a new one.
@@ -49,21 +50,22 @@ def write_dataset(
         )
     # Pictures have a size from the first reset on.
     env.reset(seed=0)
-    dataset = LeRobotDataset.create(
-        folder.name,
-        rate,
-        features(env, cameras),
-        root=folder,
-        robot_type=Path(inner.scene.instrument.model).stem,
-    )
     task, seeds = describe_task(env), []
-    for episode in episodes:
-        for frame in _frames(episode):
-            dataset.add_frame({**frame, "task": task})
-        dataset.save_episode()
-        seeds.append(episode.seed)
-    dataset.finalize()
-    (folder / PROVENANCE).write_text(json.dumps({**recorded, "seeds": seeds}, indent=1) + "\n", encoding="utf-8")
+    with new_folder(folder) as place:
+        dataset = LeRobotDataset.create(
+            folder.name,
+            rate,
+            features(env, cameras),
+            root=place,
+            robot_type=Path(inner.scene.instrument.model).stem,
+        )
+        for episode in episodes:
+            for frame in _frames(episode):
+                dataset.add_frame({**frame, "task": task})
+            dataset.save_episode()
+            seeds.append(episode.seed)
+        dataset.finalize()
+        (place / PROVENANCE).write_text(json.dumps({**recorded, "seeds": seeds}, indent=1) + "\n", encoding="utf-8")
     return dataset
 
 

@@ -8,6 +8,7 @@ Of `liver_family`, 128 faces take 80 to 120 minutes of processor time.
 import argparse
 from pathlib import Path
 
+from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.training.recorded_faces import LANES, record_faces
 
 
@@ -20,14 +21,15 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=128, help=f"at least so many, in batches of {LANES}")
     parser.add_argument("--out", type=Path, default=Path("runs/faces.npz"))
     arguments = parser.parse_args()
-    faces = record_faces(
-        arguments.scene,
-        arguments.split,
-        arguments.level,
-        arguments.faces,
-        progress=lambda done: print(f"{done} of {arguments.faces} faces", flush=True),
-    )
-    faces.save(arguments.out)
+    with lone_run(arguments.out):
+        faces = record_faces(
+            arguments.scene,
+            arguments.split,
+            arguments.level,
+            arguments.faces,
+            progress=lambda done: print(f"{done} of {arguments.faces} faces", flush=True),
+        )
+        faces.save(arguments.out)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.rl_module import RLModule
 from ray.tune.registry import register_env
 
+from surgsim_apps.reports.output_folder import lone_run, output_folder
+
 ENV_ID, ENV_KWARGS = "SurgSim/Palpate-v0", {"scene": "phantom", "level": "standard", "memory": True}
 MODULE = Path("runs/rllib/module")
 
@@ -52,6 +54,12 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=500)
     parser.add_argument("--batch", type=int, default=2048, help="control steps of an iteration")
     options = parser.parse_args()
+    with lone_run(MODULE):
+        learn(options)
+
+
+def learn(options: argparse.Namespace) -> None:
+    """Train and save by the options of the command line."""
     ray.init(address="local", include_dashboard=False)
     register_env(ENV_ID, make_env)
     # The first environment on a machine compiles its kernels, for minutes.
@@ -62,7 +70,8 @@ def main() -> None:
     for iteration in range(options.iterations):
         result = algorithm.train()["env_runners"]
         print(f"iteration {iteration}: return {result.get('episode_return_mean', float('nan')):.2f}", flush=True)
-    algorithm.get_module().save_to_path(str(MODULE.resolve()))
+    with output_folder(MODULE) as files:
+        algorithm.get_module().save_to_path(str(files.part))
     algorithm.stop()
     ray.shutdown()
 

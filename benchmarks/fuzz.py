@@ -42,6 +42,7 @@ OURS = ("msdm_core", "surgsim_env", "surgsim_apps")
 SECONDS_MOST = 60.0  # for one input
 ADDRESS_SPACE = 16_000_000_000  # of the worker [bytes]: a table for an odd count is refused at once
 START_SECONDS = 600.0  # for the worker's start, with imports of libraries
+PREFIX = "surgsim-fuzz-"  # of temporary folders
 MESSAGE_LONGEST = 1500  # [characters]
 # Odd numbers, as text.
 ODD = (
@@ -345,7 +346,7 @@ def refusal_fault(error: Exception) -> str:
 
 def attempt(kind: Kind, files: Files) -> Outcome:
     """Read an input in a folder of its own."""
-    with tempfile.TemporaryDirectory(prefix="surgsim-fuzz-") as folder, warnings.catch_warnings():
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name, data in files.items():
             Path(folder, name).write_bytes(data)
@@ -361,13 +362,14 @@ def attempt(kind: Kind, files: Files) -> Outcome:
 
 def valid_inputs(kind: Kind) -> list[Files]:
     """The unmutated inputs of a kind."""
-    with tempfile.TemporaryDirectory(prefix="surgsim-fuzz-") as folder, warnings.catch_warnings():
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return list(kind.cases(Path(folder)))
 
 
-def work(kinds: list[str], pipe: Connection) -> None:
-    """Read inputs by kind and seed from a pipe, until the process is ended."""
+def work(kinds: list[str], pipe: Connection, folder: str) -> None:
+    """Read inputs by kind and seed from a pipe, until the process is ended; its own files are in a folder."""
+    tempfile.tempdir = folder
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
@@ -381,16 +383,16 @@ def work(kinds: list[str], pipe: Connection) -> None:
 
 
 class Worker:
-    """A process for reading inputs, started again after its end."""
+    """A process for reading inputs in a folder, started again after its end."""
 
-    def __init__(self, kinds: list[str]) -> None:
-        self.kinds = kinds
+    def __init__(self, kinds: list[str], folder: str) -> None:
+        self.kinds, self.folder = kinds, folder
         self._start()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=work, args=(self.kinds, theirs), daemon=True)
+        self.process = context.Process(target=work, args=(self.kinds, theirs, self.folder), daemon=True)
         self.process.start()
         theirs.close()
         if not self.pipe.poll(START_SECONDS):
@@ -420,10 +422,10 @@ class Worker:
 # ---- the run ----------------------------------------------------------------------------------------------------
 
 
-def run(kinds: list[str], first_seed: int, inputs: int | None, seconds: float) -> int:
+def run(kinds: list[str], first_seed: int, inputs: int | None, seconds: float, folder: str) -> int:
     """Read inputs of each kind in turn until a number or a time is over; print the table, 1 with findings."""
     counts = {name: Counter[str]() for name in kinds}
-    worker, end, seed = Worker(kinds), time.perf_counter() + seconds, first_seed * 1_000_000
+    worker, end, seed = Worker(kinds, folder), time.perf_counter() + seconds, first_seed * 1_000_000
     while (seed % 1_000_000 < inputs) if inputs else time.perf_counter() < end:
         for name in kinds:
             outcome = worker.read(name, seed)
@@ -467,7 +469,9 @@ def main() -> int:
     unknown = [name for name in kinds if name not in KINDS]
     if unknown:
         parser.error(f"--only names {unknown[0]!r}; the kinds are {', '.join(KINDS)}")
-    return run(kinds, options.seed, options.inputs, options.seconds)
+    # An ended worker leaves its files.
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
+        return run(kinds, options.seed, options.inputs, options.seconds, folder)
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ class Haptics:
         anatomy = simulation.anatomy
         simulation.hold_breath(self.apnoea)
         simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
-        with _device(self, simulation.haptic_dt) as device, _telemetry(self.out) as note:
+        with _device(self, simulation.haptic_dt) as device:
             settings = HapticSettings(relative=True, breath_button=None if self.apnoea else BREATH_BIT)
             loop = HapticLoop(simulation, device, settings)
             coupling = loop.held[0].coupling
@@ -102,7 +102,7 @@ class Haptics:
             silence = round(SILENCE / simulation.haptic_dt)
             count = None if self.seconds is None else round(self.seconds / simulation.haptic_dt)
             # Ctrl-C ends a run without an end of its own.
-            with suppress(KeyboardInterrupt):
+            with _telemetry(self.out) as note, suppress(KeyboardInterrupt):
                 while count is None or step < count:
                     pacer.wait()
                     telemetry = loop.step()
@@ -180,17 +180,24 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
 
 @contextmanager
 def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
-    """A writer of steps to telemetry.csv of a folder; without a folder it does nothing."""
+    """A writer of steps to telemetry.csv of a folder, which is kept at any end; without a folder it does nothing."""
     if folder is None:
         yield lambda telemetry: None
         return
+    failure: BaseException | None = None
     with (
         output_folder(folder, [TELEMETRY_NAME]) as files,
         (files / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
-        yield lambda telemetry: writer.writerow(_row(telemetry))
+        try:
+            yield lambda telemetry: writer.writerow(_row(telemetry))
+        except BaseException as error:
+            # Such as a closed terminal, at the next print.
+            failure = error
+    if failure is not None:
+        raise failure
 
 
 def _row(telemetry: HapticTelemetry) -> list[float | int]:

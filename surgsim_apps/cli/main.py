@@ -29,6 +29,7 @@ from surgsim_apps.cli.scenes import Scenes
 from surgsim_apps.cli.validate import Validate
 from surgsim_apps.cli.view import View
 from surgsim_apps.palpate.results import surgsim_version
+from surgsim_apps.reports.output_folder import interrupts
 from surgsim_env.scene import require_known
 
 # Commands by purpose, each with an example.
@@ -74,7 +75,7 @@ class Output(Console):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (invalid input), 130 (Ctrl-C)."""
+    """Run the command line; exit status 0, 1 (a row not met, no success), 2 (invalid input), 130 (Ctrl-C, SIGTERM)."""
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
     elif isinstance(sys.stdout, io.TextIOWrapper):
@@ -125,7 +126,7 @@ def _run(arguments: Sequence[str]) -> int:
         return 2 if ended.code else 0
     if command is None:
         return 0
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), interrupts():
         warnings.showwarning = _show_warning
         return command.run(console)
 

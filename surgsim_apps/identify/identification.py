@@ -149,7 +149,8 @@ class Identification:
 
 def make_library(recordings: Sequence[Recording], options: IdentifyOptions) -> PressLibrary:
     """Empty library of presses, deep enough for sets with their offsets."""
-    depth = (1.0 + OFFSET_SHARE) * max(depth_largest(sort_out(recording.presses)[0]) for recording in recordings)
+    usable = [sort_out(recording.presses, options.ball_radius)[0] for recording in recordings]
+    depth = (1.0 + OFFSET_SHARE) * max(map(depth_largest, usable))
     if not depth > 0.0:
         # Without a usable site `identify` raises.
         depth = options.ball_radius
@@ -177,7 +178,7 @@ def identify(
     """
     begin = time.perf_counter()
     library = make_library(recordings, options) if library is None else library
-    sorted_sets = [sort_out(recording.presses) for recording in recordings]
+    sorted_sets = [sort_out(recording.presses, options.ball_radius) for recording in recordings]
     for recording, (usable, left_out) in zip(recordings, sorted_sets):
         if len(usable) < SITES_LEAST:
             reasons = "; ".join(f"{len(sites)} with {reason}" for reason, sites in left_out.items())

@@ -10,13 +10,16 @@ A file is one set: one sample of tissue, one ball, sites pressed one after the o
 | `x_mm`, `y_mm`, `z_mm` | mm | optional, all three: place of the ball at first contact |
 | `time_s` | s | optional: time of the sample, rising within a site |
 
-Further columns are ignored.
+Further columns are ignored. Columns are separated by commas, or by semicolons or tabs, where numbers may have decimal
+commas. The text is UTF-8, or UTF-16 with a byte order mark.
 """
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +30,8 @@ from msdm_core.mesh_files import checked_content
 NEEDED = ("site", "depth_mm", "normal_force_n")
 PLACE = ("x_mm", "y_mm", "z_mm")
 TIME = "time_s"
-# Beyond any press on tissue: a larger depth [mm] or force [N] is a wrong unit or a wrong column.
-DEPTH_MOST, FORCE_MOST = 100.0, 1000.0
+# Beyond any press on tissue, in size: a wrong unit or a wrong column. Places are in a robot's reach, times since 1970.
+MOST = {"depth_mm": 100.0, "normal_force_n": 1000.0, **dict.fromkeys(PLACE, 1e4), TIME: 1e10}
 # Least share of the largest depth at full depth: robots hold a depth with noise.
 FULL_DEPTH = 0.99
 
@@ -79,23 +82,47 @@ def read_recording(path: Path) -> Recording:
     """
     checked_content(path)
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream)
-            header = [name.strip() for name in next(reader, [])]
-            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        data = path.read_bytes()
+        text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+        if "\0" in text:
+            raise csv.Error("it has NUL characters, as UTF-16 has")
+        # No column's name has one of these.
+        separator = max(",;\t", key="".join(text.splitlines()[:1]).count)
+        reader = csv.reader(StringIO(text, newline=""), delimiter=separator)
+        header = [name.strip() for name in next(reader, [])]
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except OSError as error:
         raise ValueError(f"recording {path} cannot be read: {error.strerror or error}") from None
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"recording {path} is no CSV text: {error}") from None
+        raise ValueError(f"recording {path} is no CSV text in UTF-8 ({error}): save it as CSV UTF-8") from None
     columns = _columns(path, header)
     if not rows:
         raise ValueError(f"recording {path} has no samples: give at least one line after the header")
+    if separator != ",":
+        _use_points(path, rows, columns.values())
     samples: dict[int, list[list[float]]] = {}
     for line, row in rows:
+        if any(cell.strip() for cell in row[len(header) :]):
+            raise ValueError(
+                f"recording {path}, line {line}: {len(row)} cells for {len(header)} columns; the rule is one cell a "
+                "column: separate columns by semicolons where numbers have decimal commas"
+            )
         numbers = [_number(path, line, name, row, place) for name, place in columns.items()]
         samples.setdefault(_site(path, line, numbers[0]), []).append(numbers[1:])
     names = list(columns)[1:]
     return Recording(path.stem, tuple(_press(path, site, names, rows) for site, rows in samples.items()))
+
+
+def _use_points(path: Path, rows: Sequence[tuple[int, list[str]]], columns: Collection[int]) -> None:
+    """Replace decimal commas of some columns by points."""
+    lines = {mark: line for line, row in rows for place in columns for mark in ",." if mark in "".join(row[place:][:1])}
+    if len(lines) == 2:
+        raise ValueError(
+            f"recording {path} has decimal points and commas (as in lines {lines['.']} and {lines[',']}); the rule is "
+            "one of both, and none between thousands"
+        )
+    for _, row in rows:
+        row[:] = [cell.replace(",", ".") for cell in row]
 
 
 def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
@@ -119,7 +146,7 @@ def _number(path: Path, line: int, name: str, row: Sequence[str], place: int) ->
         number = float(text)
     except ValueError:
         number = math.nan
-    most = {"depth_mm": DEPTH_MOST, "normal_force_n": FORCE_MOST}.get(name, math.inf)
+    most = MOST.get(name, math.inf)
     if not math.isfinite(number) or abs(number) > most:
         rule = "a finite number" + (f" of at most {most:g} in size" if most < math.inf else "")
         raise ValueError(f"recording {path}, line {line}: {name} is {text!r}; the rule is {rule}")

@@ -23,6 +23,11 @@ OFFSET_SHARE, OFFSET_COUNT = 0.5, 46
 DEEP_COUNT_LEAST = 4
 # Least and largest depth of a usable site over the set's median, and least rise of its force from a third of it on.
 DEPTH_SHARE_LEAST, DEPTH_SHARE_MOST, RISE_LEAST = 0.6, 1.5, 1.2
+# Least depth of a usable site over the ball's radius: depths in metres are below, as the model's are at most 1.2 radii.
+BALL_SHARE_LEAST = 0.01
+# Ranges of a usable site: Hertz' modulus of its deepest sample [Pa], from slime to cartilage and ten times beyond;
+# duration [s], up to a day of holding.
+MODULUS_RANGE, DURATION_RANGE = (1.0, 1e9), (1e-3, 1e5)
 # Depths of a sampled curve, straight in (F / E)^(2/3) between them.
 GRID_COUNT = 181
 
@@ -150,13 +155,13 @@ def _best_modulus(curve: SampledCurve, samples: SiteSamples, offsets: FloatArray
     return modulus, np.einsum("sk,sk->s", samples.force**2, samples.weight)[:, None] - modulus * across
 
 
-def sort_out(sites: Sequence[SitePress]) -> tuple[list[SitePress], dict[str, list[int]]]:
-    """Usable sites, and numbers of the others by reason; judged without a model."""
+def sort_out(sites: Sequence[SitePress], ball_radius: float) -> tuple[list[SitePress], dict[str, list[int]]]:
+    """Usable sites of a ball [m], and numbers of the others by reason; judged without a model."""
     usual = float(np.median([site.depth.max() for site in sites]))
     usable: list[SitePress] = []
     left_out: dict[str, list[int]] = {}
     for site in sites:
-        reason = _fault(site, usual)
+        reason = _fault(site, usual, ball_radius)
         if reason:
             left_out.setdefault(reason, []).append(site.site)
         else:
@@ -164,9 +169,12 @@ def sort_out(sites: Sequence[SitePress]) -> tuple[list[SitePress], dict[str, lis
     return usable, left_out
 
 
-def _fault(site: SitePress, usual: float) -> str:
+def _fault(site: SitePress, usual: float, ball_radius: float) -> str:
     """Fault of a site; empty for a usable site."""
-    if not site.depth.max() <= DEPTH_SHARE_MOST * usual:
+    deepest = float(site.depth.max())
+    if not deepest >= BALL_SHARE_LEAST * ball_radius:
+        return f"a depth below {BALL_SHARE_LEAST:.0%} of the ball's radius: are these metres, not mm?"
+    if not deepest <= DEPTH_SHARE_MOST * usual:
         return f"deeper than {DEPTH_SHARE_MOST:.0%} of the set's median"
     depth, force = site.depth[site.loading], site.force[site.loading]
     deepest = float(depth.max())
@@ -177,6 +185,11 @@ def _fault(site: SitePress, usual: float) -> str:
         return f"fewer than {DEEP_COUNT_LEAST} samples in the deeper two thirds"
     if not (force[deep] > 0.0).all():
         return "a force that is not above 0 in the deeper two thirds"
+    modulus = 0.75 * force[-1] / (math.sqrt(ball_radius) * deepest**1.5)
+    if not MODULUS_RANGE[0] <= modulus <= MODULUS_RANGE[1]:
+        return f"a modulus (Hertz) outside {MODULUS_RANGE[0]:g} to {MODULUS_RANGE[1]:g} Pa: are the forces newtons?"
+    if site.time is not None and not DURATION_RANGE[0] <= site.time[-1] - site.time[0] <= DURATION_RANGE[1]:
+        return f"a duration outside {DURATION_RANGE[0]:g} to {DURATION_RANGE[1]:g} s: are the times seconds?"
     if force[-1] < RISE_LEAST * force[deep][0]:
         return f"force that rises by less than {RISE_LEAST:g} times over the deeper two thirds"
     return ""

@@ -2,6 +2,7 @@
 
 import hmac
 import http
+import re
 import secrets
 from collections.abc import Awaitable, Callable
 from contextlib import redirect_stdout
@@ -18,7 +19,8 @@ from websockets.http11 import Request, Response
 from surgsim_apps.live.exchange_records import LiveError
 
 LOOPBACK = "127.0.0.1"
-NAMES = (LOOPBACK, "localhost")
+# Of this machine, with any port: an SSH tunnel may begin at another one. No name that a stranger's DNS answers.
+OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 # Sockets of keyboards, gamepads and frame rates: `hand.js` opens them.
 HAND_PATH = "/hand"
 # In this order: the second sends the server what the first counts.
@@ -110,8 +112,12 @@ class GuardedServer:
     def _refusal(self, port: int, request: Request) -> Response | None:
         """The refusal of a request to a port, with its reason, or None for an accepted one."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        if len(hosts) != 1 or hosts[0] not in [f"{name}:{port}" for name in NAMES]:
-            return _refuse(http.HTTPStatus.MISDIRECTED_REQUEST, "this server has another name (Host)")
+        if len(hosts) != 1 or not OWN_HOST.fullmatch(hosts[0]):
+            return _refuse(
+                http.HTTPStatus.MISDIRECTED_REQUEST,
+                f"this server answers to {LOOPBACK} and localhost alone (Host): from another machine open a tunnel, "
+                f"ssh -L {port}:{LOOPBACK}:{port} HOST, and then the printed address",
+            )
         # A browser sends the origin of the page with each socket that the page opens.
         if origins != [f"http://{hosts[0]}"] and (origins or "Upgrade" in request.headers):
             return _refuse(http.HTTPStatus.FORBIDDEN, "the request comes from another site's page (Origin)")

@@ -1,11 +1,13 @@
-"""Results of a command, written into a temporary folder beside their places and renamed at the end."""
+"""Results of a command or script, written into a temporary folder beside their places and renamed at the end."""
 
 import contextlib
 import errno
 import itertools
 import os
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +54,7 @@ def output_folder(
         option: of the command, for messages.
 
     Raises:
-        OSError: the folder or a result cannot be written.
+        OSError: the folder or a result cannot be written, or the disk is full (names the folder or file).
     """
     folder = next_free(folder) if numbered else folder
     # The working folder may change.
@@ -64,24 +66,97 @@ def output_folder(
     except OSError as error:
         raise OSError(f"{option} {folder}: cannot be written ({error.strerror}); choose another folder") from None
     try:
-        try:
+        with _room_in(folder):
             yield OutputFolder(folder, part)
-        except OSError as error:
-            if error.errno != errno.ENOSPC:
-                raise
-            raise OSError(f"{option} {folder}: its disk is full; free some space, or choose another folder") from None
-        written = [path.relative_to(part) for path in sorted(part.rglob("*")) if path.is_file()]
-        for name in written:
-            (root / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(part / name, root / name)
-        for name in {Path(name) for name in names}.difference(written):
+            written = [path.relative_to(part) for path in sorted(part.rglob("*")) if path.is_file()]
+            for name in written:
+                (root / name).parent.mkdir(parents=True, exist_ok=True)
+        # A process killed in between leaves new results without some of the set, but none beside an older one.
+        for name in {*map(Path, names), *written}.difference(written[:1]):
             (root / name).unlink(missing_ok=True)
+        for name in written:
+            os.replace(part / name, root / name)
     finally:
         shutil.rmtree(part, ignore_errors=True)
         if is_new:
             # A folder with results stays.
             with contextlib.suppress(OSError):
                 root.rmdir()
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Temporary place of a new folder, to be made in a `with`; it appears at its end, after an error it does not."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with _room_in(folder), tempfile.TemporaryDirectory(prefix=PART, dir=folder.parent) as part:
+        place = Path(part, folder.name)
+        yield place
+        place.rename(folder)
+
+
+@contextlib.contextmanager
+def _room_in(folder: Path) -> Iterator[None]:
+    """Name the folder, or the file, in the error of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        place = error.filename or folder
+        raise OSError(f"{place}: {error.strerror}; free disk space, or choose another folder") from None
+
+
+@contextlib.contextmanager
+def interrupts() -> Iterator[None]:
+    """SIGTERM, and SIGHUP of a closed terminal, as KeyboardInterrupt within a `with`: it ends as by Ctrl-C."""
+    # `nohup` ignores SIGHUP, and only the main thread may handle signals.
+    # Windows has no SIGHUP.
+    known = [signal.Signals[name] for name in ("SIGTERM", "SIGHUP") if name in signal.Signals.__members__]
+    possible = known if threading.current_thread() is threading.main_thread() else []
+    signals = [number for number in possible if signal.getsignal(number) is signal.SIG_DFL]
+
+    def interrupt(*_: object) -> None:
+        # A session that ends sends more of them, which would interrupt the writing of results.
+        for number in signals:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for number in signals:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in signals:
+            signal.signal(number, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def lone_run(result: Path) -> Iterator[None]:
+    """The only run that writes a result, in a `with`, and `interrupts`.
+
+    Raises:
+        OSError: another run writes it, or its folder cannot be written.
+    """
+    # POSIX alone has it; commands start without it.
+    import fcntl
+
+    place = result.resolve()
+    place.parent.mkdir(parents=True, exist_ok=True)
+    lock = place.with_name(f".{place.name}.lock")
+    with interrupts(), lock.open("a") as file:
+        try:
+            # The system releases it at the end of the process, whatever the end is.
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.fstat(file.fileno()).st_nlink:
+                # Another run ended after `open`, and a third may have locked a new file.
+                raise BlockingIOError
+        except BlockingIOError:
+            raise OSError(f"{result} is written by another run: end that one, or name another result") from None
+        try:
+            with _room_in(place.parent):
+                yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def next_free(path: Path) -> Path:

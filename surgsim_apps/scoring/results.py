@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from msdm_core.mesh_files import checked_content
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_env.scene import STILL, agents_folder
 
@@ -75,16 +76,14 @@ class Result:
 
     def save(self, folder: Path) -> Path:
         """Write it into a folder; replaces an older result of the same method and place."""
-        path = folder / f"{self.place}_{self.method}.json"
+        name = f"{self.place}_{self.method}.json"
         table = asdict(self)
         table["seeds"] = seeds_text(self.seeds)
-        table["figures"] = {
-            name: [_written(value) for value in astuple(figure)] for name, figure in self.figures.items()
-        }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lines = [f" {json.dumps(name)}: {json.dumps(value)}" for name, value in table.items()]
-        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-        return path
+        table["figures"] = {key: [_written(value) for value in astuple(figure)] for key, figure in self.figures.items()}
+        lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in table.items()]
+        with output_folder(folder) as files:
+            (files / name).write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+        return folder / name
 
 
 def shipped_results() -> Path:

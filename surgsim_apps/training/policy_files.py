@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from msdm_core.mesh_files import checked_content
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.training.acquisition import Acquisition
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
 from surgsim_env.envs import TASKS
@@ -172,15 +173,20 @@ def policy_path(text: str) -> Path:
 
 
 def save_policy(decider: PolicyNetwork | Acquisition, description: PolicyDescription, path: Path) -> TrainedPolicy:
-    """Write NAME.json and, for a network, NAME.safetensors beside it; returns the policy."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if isinstance(decider, Acquisition):
-        written = replace(description, acquisition=decider.values, network=None)
-    else:
-        written = replace(description, acquisition=None, network=decider.layout)
-        weights = {name: weight.contiguous() for name, weight in decider.state_dict().items()}
-        path.with_suffix(".safetensors").write_bytes(safetensors.torch.save(weights))
-    path.with_suffix(".json").write_text(json.dumps(asdict(written), indent=1) + "\n", encoding="utf-8")
+    """Write NAME.json and, for a network, NAME.safetensors beside it; returns the policy.
+
+    Raises:
+        OSError: they cannot be written; an older policy stays.
+    """
+    names = [path.with_suffix(suffix).name for suffix in (".json", ".safetensors")]
+    with output_folder(path.parent, names) as files:
+        if isinstance(decider, Acquisition):
+            written = replace(description, acquisition=decider.values, network=None)
+        else:
+            written = replace(description, acquisition=None, network=decider.layout)
+            weights = {name: weight.contiguous() for name, weight in decider.state_dict().items()}
+            (files / names[1]).write_bytes(safetensors.torch.save(weights))
+        (files / names[0]).write_text(json.dumps(asdict(written), indent=1) + "\n", encoding="utf-8")
     return TrainedPolicy(decider, written)
 
 

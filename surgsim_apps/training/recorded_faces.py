@@ -18,6 +18,7 @@ from scipy.interpolate import RBFInterpolator
 
 from msdm_core.mesh import FloatArray
 from msdm_core.mesh_files import checked_content
+from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.training.site_surrogate import SurrogateFace
 from surgsim_env.coupling import ForceReading
 from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, ORGAN_MAP_SPREAD, LesionEstimator, TouchMap, interpolated
@@ -92,12 +93,12 @@ class RecordedFaces:
 
     def save(self, path: Path) -> None:
         """Write the recording, numbers in single precision."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         values = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
         single = {
             name: value.astype(np.float32) if value.dtype == np.float64 else value for name, value in values.items()
         }
-        np.savez_compressed(path, **single)
+        with output_folder(path.parent) as files:
+            np.savez_compressed(files / path.name, **single)
 
 
 def _on_surface(surface: FloatArray, extent: FloatArray, points: FloatArray) -> FloatArray:

@@ -1,5 +1,6 @@
 """Interface of instruments in MuJoCo for simulations and tasks: control of tip and jaw, readings, saved state."""
 
+import logging
 from dataclasses import dataclass
 
 import mujoco
@@ -9,6 +10,10 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import dot, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
+
+# Without a handler MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working folder.
+if mujoco.get_mju_user_warning() is None:
+    mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 # Time from open to closed [s].
 STROKE_TIME = 0.5

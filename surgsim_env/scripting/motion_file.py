@@ -14,6 +14,8 @@ from msdm_core.mesh_files.mesh_file import checked_content
 BUTTONS_LARGEST = 2**31 - 1
 # Prefix of the columns of the tip's position [m] in recordings of `surgsim view`.
 TIP_PREFIX = "tip_"
+# Key of a row's cells beyond the columns.
+MORE = "beyond the header"
 
 
 class Motion(NamedTuple):
@@ -49,7 +51,7 @@ def read_motion(path: Path, mark: str = "", *, of_tip: bool = False) -> Motion:
         OSError: the file cannot be read.
     """
     with checked_content(path).open(newline="", encoding="utf-8", errors="replace") as file:
-        reader = csv.DictReader(file)
+        reader = csv.DictReader(file, restkey=MORE)
         try:
             names = reader.fieldnames or []
             *places, pressed = motion_columns(mark)
@@ -90,6 +92,8 @@ def _rows(reader: csv.DictReader, columns: Sequence[str], file_name: str) -> Ite
     """Numbers of each row."""
     for row in reader:
         line = reader.line_num
+        if any(row.get(MORE, ())):
+            raise ValueError(f"{file_name}, line {line}: more cells than columns; decimal commas must be points")
         try:
             numbers = [float(row[name]) for name in columns]
         except (TypeError, ValueError):

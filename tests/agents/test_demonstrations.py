@@ -121,6 +121,25 @@ def test_a_recording_that_is_interrupted_is_written(folder, monkeypatch, capsys)
     assert written.total_episodes == 2 and written.total_steps == 8
 
 
+def test_a_data_set_is_written_whole_or_not_at_all(folder, monkeypatch):
+    from agents.record_demonstrations import player, record, write_dataset
+
+    env = gym.make("SurgSim/Palpate-v0", max_episode_steps=2)
+    episodes = list(record(env, player(f"{__name__}:Idle", env, {}), range(1), keep_failures=True))
+    create, name = minari.create_dataset_from_buffers, "surgsim/palpate/killed-v0"
+
+    def killed(*given, **options):
+        create(*given, **options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(minari, "create_dataset_from_buffers", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(episodes, env, name, algorithm_name="nobody")
+    assert name not in minari.list_local_datasets()
+    monkeypatch.undo()
+    assert write_dataset(episodes, env, name, algorithm_name="nobody").total_steps == 2
+
+
 class Watching:
     """Commands nothing, and says what it was shown: an actor that takes batches, as policies do."""
 

@@ -184,6 +184,12 @@ def test_a_run_leaves_a_policy_that_plays_and_is_resumed(tmp_path: Path, monkeyp
     again = train(recipe, tmp_path, 0, decisions=288, every=288)
     assert again.num_timesteps == 288 and again.get_env().venv.stage == stages[1]
     assert (tmp_path / "from_64" / "progress.csv").is_file() and (tmp_path / "from_0" / "evaluations.npz").is_file()
+    # A run that ended is not trained again, a lost policy comes back, and a checkpoint without its scales is none.
+    (tmp_path / "policy.json").unlink()
+    (tmp_path / "checkpoint_9999_steps.zip").write_bytes(b"half")
+    assert train(recipe, tmp_path, 0, decisions=288, every=288).num_timesteps == 288
+    with pytest.raises(ValueError, match="seed"):
+        train(recipe, tmp_path, 1, decisions=288, every=288)
     policy = load_policy(tmp_path / "policy.json")
     assert policy.description.trained_steps == 288 and policy.description.action_repeat == 5
     envs = environments(None)

@@ -107,16 +107,18 @@ def test_a_search_of_few_generations_lowers_the_cost(monkeypatch):
     assert first.best.values == again.best.values and first.episode_count == 360
 
 
-def test_the_script_writes_a_policy_that_presses(tmp_path, capsys, monkeypatch):
-    """Of each generation, where each costs less than the one before."""
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_script_writes_a_policy_that_presses(tmp_path, capsys, monkeypatch, sign):
+    """Of each generation where each costs less than the one before, else of the first."""
     costs = itertools.count(2)
-    monkeypatch.setattr(learn_sites, "cost", lambda errors: 1.0 / next(costs))
+    monkeypatch.setattr(learn_sites, "cost", lambda errors: sign / next(costs))
     out = tmp_path / "sites.json"
     sizes = {"generations": 2, "population": 4, "episodes": 2, "check_episodes": 2, "processes": 2}
     recordings = {"faces": [FILE], "weights": None, "check_faces": [FILE]}
     learn(argparse.Namespace(out=out, seed=0, spread=FIRST_SPREAD, **sizes, **recordings))
-    assert len(re.findall(r"cost (\d+\.\d+)", capsys.readouterr().out)) == 3
+    assert len(re.findall(r"cost (-?\d+\.\d+)", capsys.readouterr().out)) == 3
     policy = load_policy(out)
-    assert policy.description.acquisition != Acquisition().values and policy.description.trained_steps == 16
+    improved = policy.description.acquisition != Acquisition().values
+    assert (improved, policy.description.trained_steps) == ((True, 16) if sign > 0.0 else (False, 0))
     observation, _ = SiteSurrogate(FACES).reset(seed=1)
     assert (np.abs(policy.act(observation[None], np.ones(1, dtype=bool))) <= 1.0).all()

@@ -46,8 +46,8 @@ def test_a_seed_gives_its_input_again(name):
     assert sum(files not in fuzz.valid_inputs(kind) for files, _ in inputs[0]) >= 18
 
 
-def test_a_worker_that_ended_is_a_finding():
-    worker = fuzz.Worker(["csv"])
+def test_a_worker_that_ended_is_a_finding(tmp_path):
+    worker = fuzz.Worker(["csv"], str(tmp_path))
     try:
         worker.process.kill()
         worker.process.join()
@@ -55,3 +55,12 @@ def test_a_worker_that_ended_is_a_finding():
         assert worker.read("csv", 4).status in ("valid", "refused")
     finally:
         worker.close()
+
+
+def test_a_run_leaves_no_files_of_a_worker_that_was_too_slow(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(fuzz, "SECONDS_MOST", 0.05)
+    monkeypatch.setattr("sys.argv", ["fuzz", "--only", "scenes", "--inputs", "1"])
+    fuzz.main()
+    assert not list(tmp_path.iterdir())

@@ -61,6 +61,7 @@ def test_press_recorded_by_hand_is_felt(tmp_path):
         ("time,x,y,z\n0,0,0,0\n1,0,nan,0\n", "row 1"),
         ("time,x,y,z\n0,0,0,0\n1,0,0,0\n1,0,0,0\n", "row 2"),
         ("time,x,y,z,buttons\n0,0,0,0,-1\n", "line 2: .*-1"),
+        ("time,x,y,z\n0,5,0,1,0,2,0,3\n", "line 2"),
     ],
 )
 def test_bad_file_is_refused_by_name_and_row(tmp_path, text, named):

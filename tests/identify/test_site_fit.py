@@ -44,8 +44,8 @@ def test_sites_that_cannot_be_used_are_named_with_their_reason():
     made = recording(hertz)
     press = made.presses[0]
 
-    def other(site, depth=press.depth, force=press.force):
-        return SitePress(site, press.place, depth, force)
+    def other(site, depth=press.depth, force=press.force, time=None):
+        return SitePress(site, press.place, depth, force, time)
 
     bad = [
         other(100, depth=0.3 * press.depth),
@@ -54,8 +54,30 @@ def test_sites_that_cannot_be_used_are_named_with_their_reason():
         other(103, force=np.full(len(press.force), 0.1)),
         other(104, depth=20.0 * press.depth),
     ]
-    usable, left_out = sort_out([*made.presses, *bad])
+    usable, left_out = sort_out([*made.presses, *bad], 0.006)
     assert [site.site for site in usable] == [press.site for press in made.presses]
     assert {reason.split(" ")[0]: sites for reason, sites in left_out.items()} == {
         "less": [100], "fewer": [101], "a": [102], "force": [103], "deeper": [104]
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("factors", "reason"),
+    [
+        *(((depth, 1.0, 1.0), "metres") for depth in (1e-3, 1e-300)),
+        *(((1.0, force, 1.0), "newtons") for force in (1e-300, 1e-6, 1e9)),
+        *(((1.0, 1.0, time), "seconds") for time in (1e-300, 1e-6, 1e9)),
+    ],
+)
+@pytest.mark.parametrize("ball_radius", [0.0005, 0.006, 0.05])
+def test_presses_that_no_tissue_has_are_not_used(factors, reason, ball_radius):
+    """Also where all sites of a set have the same wrong unit."""
+    made = recording(hertz, depth=0.5 * ball_radius, time=np.linspace(0.1, 2.0, 10))
+    assert len(sort_out(made.presses, ball_radius)[0]) == len(made.presses)
+    depth, force, time = factors
+    wrong = [
+        SitePress(press.site, press.place, depth * press.depth, force * press.force, time * press.time)
+        for press in made.presses
+    ]
+    usable, left_out = sort_out(wrong, ball_radius)
+    assert not usable and len(left_out) == 1 and reason in next(iter(left_out))

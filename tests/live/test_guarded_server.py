@@ -56,17 +56,23 @@ def test_the_page_comes_with_the_token_alone(server):
 @pytest.mark.parametrize(
     ("host", "status"),
     [
-        *(("127.0.0.1:{}", 200), ("localhost:{}", 200), ("evil.example:{}", 421), ("127.0.0.1", 421)),
-        *(("127.0.0.1.evil.example:{}", 421), ("127.0.0.1:1", 421), ("192.168.0.7:{}", 421), ("x@127.0.0.1:{}", 421)),
+        *(("127.0.0.1:{}", 200), ("localhost:{}", 200), ("[::1]:{}", 200)),
+        # Tunnels that begin at another port, or at 80.
+        *(("127.0.0.1:1", 200), ("localhost:9090", 200), ("127.0.0.1", 200), ("localhost", 200)),
+        *(("evil.example:{}", 421), ("127.0.0.1.evil.example:{}", 421), ("192.168.0.7:{}", 421)),
+        *(("x@127.0.0.1:{}", 421), ("localhost:9090:1", 421), ("localhost:", 421), ("127.0.0.1.:80", 421)),
+        *(("127x0.0.1:80", 421), ("localhost.evil.example", 421), ("", 421)),
     ],
 )
 def test_a_name_of_another_machine_is_refused(server, host, status):
-    assert get(server, f"/{server.token}", Host=host.format(server.viser.get_port()))[0] == status
+    port = server.viser.get_port()
+    answered, body, _ = get(server, f"/{server.token}", Host=host.format(port))
+    assert answered == status and (status == 200) != (f"ssh -L {port}:127.0.0.1:{port}".encode() in body)
 
 
 def test_a_page_of_another_site_is_refused(server, own):
     assert get(server, f"/{server.token}", Origin=f"http://{own}")[0] == 200
-    for origin in ("http://evil.example", "null", f"https://{own}"):
+    for origin in ("http://evil.example", "null", f"https://{own}", "http://localhost:9090", "http://127.0.0.1"):
         assert get(server, f"/{server.token}", Origin=origin)[0] == 403
 
 
@@ -86,9 +92,15 @@ def test_no_socket_is_opened_without_origin_and_token(server, own, path, origin,
     assert refused.value.response.status_code == status
 
 
-def test_viser_and_the_hands_have_sockets_below_the_token(server, own):
+@pytest.mark.parametrize("named", ["{}", "localhost:9090"])
+def test_viser_and_the_hands_have_sockets_below_the_token(server, own, named):
+    """Also through a tunnel that begins at another port, which the browser names."""
+    address = ("127.0.0.1", server.viser.get_port())
+    own = named.format(own)
+
     async def attempt():
         options = {"origin": f"http://{own}", "max_size": None, "compression": None, "open_timeout": SECONDS}
+        options |= dict(zip(("host", "port"), address))
         protocol = f"viser-v{viser.__version__}"
         async with (
             connect(f"ws://{own}/{server.token}/", subprotocols=[protocol], **options) as tab,

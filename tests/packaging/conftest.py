@@ -14,6 +14,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[2]
 BUILD_INPUTS = (
     "pyproject.toml",
+    "hatch_build.py",
     "README.md",
     "LICENSE",
     "msdm_core",

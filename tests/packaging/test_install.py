@@ -1,5 +1,7 @@
 """A wheel carries the scenes; an editable install uses those of the checkout, not the copy hatchling leaves."""
 
+import sys
+import tarfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +34,31 @@ def test_wheel_holds_the_packages_their_data_and_nothing_else(wheel):
     agents = {f"agents/{part}/{name}" for part in AGENTS for name in shipped_files(REPOSITORY / "agents" / part)}
     assert shipped == shipped_files(REPOSITORY / "scenes") | agents
     assert not [name for name in names if name.endswith(".pyc")]
+
+
+def test_archives_of_a_checkout_hold_its_tracked_files_alone(tmp_path):
+    project = copy_of_project(tmp_path / "project")
+    (project / ".gitignore").write_text("*.log\n")
+    git = ["git", "-c", "user.name=x", "-c", "user.email=x@x"]
+    for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-q", "-m", "all"]):
+        run([*git, *arguments], cwd=project)
+    tracked = set(run([*git, "ls-files"], cwd=project).splitlines())
+    (project / ".git" / "info" / "exclude").write_text("mine.toml\n")
+    for place in ("", "scenes", "scenes/organs", "agents/policies", "agents/results", "surgsim_env/x", "surgsim_apps"):
+        (project / place).mkdir(exist_ok=True)
+        for name in ("secret.key", ".env", "mine.toml", "new.json", "new.py", "run.log"):
+            (project / place / name).write_text("must not ship")
+    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path / "dist", project])
+    run([sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", tmp_path / "wheel", project])
+    (archive,), (wheel,), (direct,) = (tmp_path.glob(f"{end}") for end in ("dist/*.gz", "dist/*.whl", "wheel/*.whl"))
+    with tarfile.open(archive) as tar:
+        assert {name.partition("/")[2] for name in tar.getnames()} == tracked | {"PKG-INFO"}
+    names = zipfile.ZipFile(wheel).namelist()
+    assert names == zipfile.ZipFile(direct).namelist()
+    shipped = ("msdm_core/", "surgsim_env/", "surgsim_apps/", "scenes/", "agents/policies/", "agents/results/")
+    assert len([name for name in names if ".dist-info/" not in name]) == sum(
+        name.startswith(shipped) for name in tracked
+    )
 
 
 def test_wheel_says_that_its_packages_are_typed(wheel):

@@ -1,10 +1,16 @@
 """Results of commands appear at the end, and after an error none does."""
 
 import errno
+import itertools
+import os
+import signal
+import subprocess
+import sys
 
 import pytest
 
-from surgsim_apps.reports.output_folder import output_folder
+from surgsim_apps.reports.output_folder import interrupts, lone_run, new_folder, output_folder
+from tests.architecture import REPOSITORY
 
 NAMES = ["a.csv", "b.png", "images/c.png"]
 
@@ -63,6 +69,93 @@ def test_a_place_that_cannot_be_written_is_named_at_once(tmp_path):
         output_folder(tmp_path / "file").__enter__()
 
 
-def test_a_full_disk_is_an_error_with_the_folder(tmp_path):
-    with pytest.raises(OSError, match=rf"--out {tmp_path}.*another folder"), output_folder(tmp_path, NAMES):
-        raise OSError(errno.ENOSPC, "No space left on device")
+@pytest.mark.parametrize("kept", range(4))
+def test_a_killed_process_leaves_no_new_result_beside_an_older_one(tmp_path, monkeypatch, kept):
+    replace, calls = os.replace, itertools.count()
+
+    def killed(*places):
+        if next(calls) == kept:
+            raise KeyboardInterrupt
+        replace(*places)
+
+    with output_folder(tmp_path) as files:
+        write(files, "old")
+    monkeypatch.setattr(os, "replace", killed)
+    try:
+        with output_folder(tmp_path, NAMES) as files:
+            write(files, "new")
+    except KeyboardInterrupt:
+        assert kept < 3
+    assert content(tmp_path) == (dict.fromkeys(NAMES[:kept], "new") if kept else {"a.csv": "old"})
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+@pytest.mark.parametrize("place", [None, "elsewhere/file"])
+@pytest.mark.parametrize("writing", [output_folder, lone_run, new_folder])
+def test_a_full_disk_is_named(tmp_path, number, place, writing):
+    with pytest.raises(OSError) as refused, writing(tmp_path / "out"):
+        raise OSError(number, os.strerror(number), place)
+    assert str(refused.value).startswith(f"{place or tmp_path}") and "free disk space" in str(refused.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_new_folder_appears_whole_or_not_at_all(tmp_path):
+    for error in (KeyboardInterrupt, None):
+        try:
+            with new_folder(tmp_path / "deep" / "set") as place:
+                place.mkdir()
+                (place / "a").write_text("a", encoding="utf-8")
+                assert not (tmp_path / "deep" / "set").exists()
+                if error:
+                    raise error
+        except KeyboardInterrupt:
+            assert not content(tmp_path)
+    assert content(tmp_path) == {"deep/set/a": "a"}
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from surgsim_apps.reports.output_folder import lone_run
+with lone_run(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+def test_a_second_run_into_a_result_is_refused_until_the_first_ends(tmp_path, end):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    given = [sys.executable, "-c", HOLD, tmp_path / "link" / "policy.json"]
+    first = subprocess.Popen(
+        given, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    )
+    assert first.stdout is not None and first.stdout.readline() == b"held\n"
+    with pytest.raises(OSError, match=r"policy.json"), lone_run(tmp_path / "real" / "policy.json"):
+        pass
+    with lone_run(tmp_path / "real" / "other.json"):
+        pass
+    first.send_signal(end)
+    first.communicate(timeout=60)
+    with lone_run(tmp_path / "real" / "policy.json"):
+        pass
+    assert not content(tmp_path)
+
+
+def test_signals_of_an_end_interrupt_once(monkeypatch):
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with pytest.raises(KeyboardInterrupt), interrupts(), interrupts():
+            try:
+                signal.raise_signal(number)
+            finally:
+                # While results are written.
+                signal.raise_signal(signal.SIGHUP)
+                signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(number) is signal.SIG_DFL
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupts():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)

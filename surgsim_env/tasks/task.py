@@ -126,8 +126,9 @@ class Task:
     def end(self, step: ControlStep) -> str:
         """Reason of the episode's end in this control step; "" while it goes on. Called once for each.
 
-        It is the name of a declared reward of success or failure, which is then paid, or "fault", "hard_force", "damage",
-        "success" or "done", which need none. Failures are "fault", "hard_force", "damage" and the declared ones.
+        It is the name of a declared reward of success or failure, which is then paid, or "fault", "hard_force",
+        "damage", "success" or "done", which need none. Failures are "fault", "hard_force", "damage" and the declared
+        ones.
         """
         if step.fault:
             return "fault"

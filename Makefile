@@ -15,6 +15,8 @@ UV := uv==0.13.9
 # Asked for before the `agents` extra, so that a CPU build of just this version is taken where pip is shown one.
 TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
+# Trainers of docs/training_loops.md, MIT. SuperSuit's tinyscaler has no wheels for later versions of Python.
+TRAINERS := torchrl==0.14.1 'supersuit==3.11.0;python_version<"3.13"'
 WITH_RAY := --editable=.[dev,distributed]
 # LeRobot asks for numpy below 2.3, this project for 2.3 or later, and LeRobot runs with it: pip installs the second over
 # the first, and says so.
@@ -218,7 +220,7 @@ $(VENV)/.ready-dev: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	@touch $(VENV)/.ready-demo
 
 $(VENV)/.ready-agents: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
-	$(call install,$(TORCH) $(WITH_AGENTS))
+	$(call install,$(TORCH) $(WITH_AGENTS) $(TRAINERS))
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
 
 $(VENV)/.ready-distributed: pyproject.toml $(CONSTRAINTS) $(VENV)/.made

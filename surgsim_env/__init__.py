@@ -1,11 +1,24 @@
 """surgsim_env: soft organs and robotic instruments as Gymnasium environments; importing it registers their ids."""
 
 import importlib
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msdm_core
 from msdm_core import numba_cache
+
+try:
+    # It loads the OpenGL of MUJOCO_GL, which only pictures need: without that, the first picture says why.
+    importlib.import_module("mujoco")
+except Exception:  # each missing library raises its own type
+    if (_opengl := os.environ.get("MUJOCO_GL")) is None:
+        raise
+    os.environ["MUJOCO_GL"] = "disabled"
+    try:
+        importlib.import_module("mujoco")
+    finally:
+        os.environ["MUJOCO_GL"] = _opengl
 
 with numba_cache.kernel_cache(Path(msdm_core.__file__).parent, Path(__file__).parent):
     # Before anything else imports them: compiled code is cached where it was when it was decorated.

@@ -66,6 +66,7 @@ UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
     "msdm_core/arithmetic.py": (("**",), "powers of -1"),
     "msdm_core/material/fitting.py": (("@",), "sparse matrices, whose products are plain loops"),
     "msdm_core/material/tissue_law.py": (("sum",), "arrays"),
+    "msdm_core/mesh_files/surface_io.py": (("sum",), "counts"),
     "msdm_core/meshing/segmentation_meshing.py": (("sum",), "whole numbers"),
     "surgsim_env/instruments/arm/arm_instrument.py": (("sum",), "whole numbers"),
     "surgsim_apps/palpate/contrast_map.py": (("sum", "scipy.optimize"), "counts; the assignment only compares"),

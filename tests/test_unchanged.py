@@ -62,7 +62,8 @@ def lines(value: object, path: str = "") -> Iterator[str]:
     if hasattr(value, "_asdict"):
         value = value._asdict()  # type: ignore[union-attr]
     if isinstance(value, Mapping):
-        for key in sorted(value):
+        # Success by the name that trainers read.
+        for key in sorted(key for key in value if key.removeprefix("_") != "is_success"):
             yield from lines(value[key], f"{path}.{key}")
     elif isinstance(value, np.ndarray) and value.dtype != object and value.dtype.kind != "U" and value.ndim:
         plain = np.ascontiguousarray(value)

@@ -61,7 +61,6 @@ class LeRobotEnv(gym.Wrapper):
     def step(self, action: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment; a network's actions beyond [-1, 1] are clipped."""
         _, reward, terminated, truncated, info = self.env.step(np.clip(action, -1.0, 1.0))
-        info = {**info, "is_success": bool(info.get("success", False))}
         return observe(self.env, self.cameras), reward, terminated, truncated, info
 
 

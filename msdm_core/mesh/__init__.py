@@ -13,7 +13,7 @@ from msdm_core.mesh.surface import (
     surface_volume,
     triangle_lattice,
 )
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray, TetMesh
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray, TetMesh, used_nodes
 
 __all__ = [
     "TET_FACES",
@@ -35,4 +35,5 @@ __all__ = [
     "surface_cell",
     "surface_volume",
     "triangle_lattice",
+    "used_nodes",
 ]

@@ -164,6 +164,13 @@ def tet_volumes(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     return dot(b - a, np.cross(c - a, d - a)) / 6.0
 
 
+def used_nodes(points: FloatArray, tets: NDArray[np.integer]) -> tuple[FloatArray, NDArray[np.integer]]:
+    """Points of tets, and the tets renumbered to them."""
+    check_indices(tets, len(points), "tet", "nodes")
+    used, renumbered = np.unique(tets, return_inverse=True)
+    return points[used], renumbered.reshape(-1, 4)
+
+
 def area_vectors(corners: FloatArray) -> FloatArray:
     """Area vector of each triangle, (b - a) x (c - a) / 2 [m^2], of corners (..., 3, 3) [m], shape (..., 3)."""
     a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
@@ -293,4 +300,9 @@ def _checked_region(region: ArrayLike | None, tet_count: int) -> IntArray:
     array = np.asarray(region)
     if array.shape != (tet_count,):
         raise MeshError(f"region has shape {array.shape}; the rule is one integer tag per tet, ({tet_count},)")
-    return array.astype(np.int32)
+    with np.errstate(invalid="ignore"):
+        tags = array.astype(np.int32)
+    wrong = np.flatnonzero(tags != array)
+    if wrong.size:
+        raise MeshError(f"region of tet {wrong[0]} is {array[wrong[0]]}; tags are whole numbers of 32 bits")
+    return tags

@@ -1,8 +1,9 @@
-"""Common parts of mesh and surface files: suffix, guarded parser, unit of length, extent."""
+"""Common parts of mesh and surface files: stand-ins, suffix, content, guarded parser, unit of length, extent."""
 
 import contextlib
 import io
 import math
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
@@ -20,22 +21,67 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 SMALLEST_EXTENT = 1e-3
 LARGEST_EXTENT = 2.0
 
+# First bytes, in lower case, of a file that stands in for the wanted one.
+STAND_INS = {
+    b"version https://git-lfs.github.com/spec/": "a Git LFS pointer: git lfs pull",
+    b"/annex/objects/": "a git-annex pointer: git annex get",
+    b"<!doctype html": "a web page: download the file itself",
+}
+
+# Beginnings of the formats, tried in this order.
+CONTENTS = {
+    ".vtu": rb"(?s).*<VTKFile\b[^>]*type=.UnstructuredGrid",
+    ".vtp": rb"(?s).*<VTKFile\b[^>]*type=.PolyData",
+    ".vtk": rb"# vtk DataFile",
+    ".msh": rb"\$(MeshFormat|NOD|Comments)\s",
+    ".mesh": rb"(?s).{0,200}?\bMeshVersionFormatted\b",
+    ".ply": rb"ply\s",
+    ".stl": rb"(?is)\s*solid\b.*?\bfacet\s+normal\b",
+    ".obj": rb"(?ms).*?^v\s+[-+\d.]+\S*\s+[-+\d.]+\S*\s+[-+\d.]+.*?^v\s",
+}
+
 Parsed = TypeVar("Parsed")
+
+
+def checked_content(path: Path) -> Path:
+    """Path of a file, of any format, with a content of its own; a missing file is left to its reader.
+
+    Raises:
+        MeshError: a pointer of Git LFS or git-annex, or a web page, in place of the file.
+    """
+    with contextlib.suppress(OSError), path.open("rb") as stream:
+        head = stream.read(64).lower()
+        for start, content in STAND_INS.items():
+            if head.startswith(start):
+                raise MeshError(f"{path} is {content}")
+    return path
 
 
 def checked_file(path: str | Path, suffixes: Iterable[str], advice: str) -> Path:
     """Path of an existing file with one of the suffixes.
 
     Raises:
-        MeshError: no such file, or an unknown suffix; names the path and the known suffixes.
+        MeshError: no such file, an unknown suffix or a content of another; names the path and the known suffixes.
     """
-    file = Path(path)
+    file = checked_content(Path(path))
     if not file.is_file():
         raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
     known = sorted(suffixes)
     if file.suffix.lower() not in known:
         raise MeshError(f"{file}: unknown extension {file.suffix!r}; known: {', '.join(known)}: {advice}")
+    content = _content_suffix(file)
+    if content not in (None, file.suffix.lower()):
+        raise MeshError(f"{file} is a {content} by its content: rename it")
     return file
+
+
+def _content_suffix(file: Path) -> str | None:
+    """Suffix of the format that a file begins with; None for an unknown one."""
+    with file.open("rb") as stream:
+        head = stream.read(4096)
+    if file.stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little"):  # a binary STL, of n triangles
+        return ".stl"
+    return next((suffix for suffix, start in CONTENTS.items() if re.match(start, head)), None)
 
 
 def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:
@@ -44,9 +90,11 @@ def parsed(file: Path, parse: Callable[[str], Parsed], advice: str) -> Parsed:
     A number beyond the range of its type is an error, too: numpy would change it, with a warning.
 
     Raises:
-        MeshError: names the file and the parser's own reason; a MeshError of `parse` is passed on.
+        MeshError: names the file and the parser's own reason; a MeshError of `parse` is passed on; a stand-in for the
+            file.
     """
     output = io.StringIO()
+    checked_content(file)
     try:
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             with np.errstate(over="raise", invalid="raise"):

@@ -7,7 +7,8 @@ A vtu file has no field for the length unit or for region names. The FieldData a
 import re
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -16,45 +17,64 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.errors import MeshError
-from msdm_core.mesh.tet_mesh import TetMesh
+from msdm_core.mesh.tet_mesh import TetMesh, used_nodes
 from msdm_core.mesh_files.mesh_file import LengthUnit, check_extent, checked_file, metres_per_unit, parsed
 
 # meshio's name of the format under each suffix.
 FORMATS = {".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".mesh": "medit"}
 WRITTEN_SUFFIX = ".vtu"
 REGION_KEYS = ("region", "gmsh:physical", "medit:ref")
+# Numbers of the CAD model's volumes: tags only when asked for.
+_GEOMETRY_KEY = "gmsh:geometrical"
+# Most tags of an array of regions; arrays with more number the tets.
+TAGS_MOST = 255
 
 _CONVERT = "convert it, for instance: meshio convert IN OUT.vtu, or gmsh IN -save -format msh22 -o OUT.msh"
+_SAVE = {"vtu": "save it again as .vtu (ParaView)", "gmsh": "write it again: gmsh IN -save -format msh22 -o OUT.msh"}
 _VOLUME_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 
 UNIT_KEY = "length_unit_m"
 _REGION_KEY = "region/"
 
 
-def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None) -> TetMesh:
+def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None, cell_data: str | None = None) -> TetMesh:
     """Tetrahedral mesh of a vtu, vtk, gmsh (2.2, 4.1) or medit file, in metres.
 
     Args:
         path: the file, its format by suffix (.vtu, .vtk, .msh, .mesh).
         length_unit: "m", "cm", "mm" or metres per unit. May be left out only for files of `write_mesh`, which state it;
             if given it wins, with a warning if the file states another.
+        cell_data: name of the array with the tags of the regions. Default: the usual names of the formats, else the
+            only array of 2 to 255 different whole numbers, with a warning.
+
+    Warns:
+        UserWarning: left out nodes, groups and arrays, and another unit.
 
     Raises:
         ValueError: names an unknown length unit.
         MeshError: names the file and the fault: missing, not parsable, no unit, no or curved tets, an unlikely extent,
-            parts without a common face, or the first node or tet refused by TetMesh.
+            parts without a common face, several arrays of tags, or the first node or tet refused by TetMesh.
     """
     asked = None if length_unit is None else metres_per_unit(length_unit)
     file = checked_file(path, FORMATS, _CONVERT)
     if file.suffix.lower() == ".vtu":
         _check_pieces(file)
-    raw = parsed(file, _reader(FORMATS[file.suffix.lower()]), _CONVERT)
+    file_format = FORMATS[file.suffix.lower()]
+    raw, groups = parsed(file, _READERS[file_format], _SAVE["gmsh" if file_format in ("gmsh", "medit") else "vtu"])
     metres = _chosen_unit(file, asked, float(raw.field_data[UNIT_KEY].flat[0]) if UNIT_KEY in raw.field_data else None)
     tets = _only_tets(file, raw)
+    region = _region_of(file, raw, cell_data)
+    for entity, tags in groups.items():
+        if len(tags) > 1:
+            text = ", ".join(map(str, tags))
+            warnings.warn(f"{file}: volume {entity} is in the physical groups {text}: {tags[0]} is used", stacklevel=2)
     try:
-        mesh = TetMesh(np.asarray(raw.points, dtype=np.float64) * metres, tets, _region_of(raw), _region_names(raw))
+        points, used = used_nodes(np.asarray(raw.points, dtype=np.float64) * metres, tets)
+        mesh = TetMesh(points, used, region, _region_names(raw))
     except MeshError as error:
-        raise MeshError(f"{file}: {error}") from error
+        raise MeshError(f"{file}: {error}{_repeated(tets, region)}") from error
+    if len(points) < len(raw.points):
+        warnings.warn(f"{file}: {len(raw.points) - len(points)} nodes of no tet are left out", stacklevel=2)
     check_extent(mesh.points, metres, file)
     return mesh
 
@@ -79,11 +99,42 @@ def write_mesh(path: str | Path, mesh: TetMesh) -> None:
     file.write_bytes(head + mark + _field_data(mesh) + tail)
 
 
-def _reader(file_format: str) -> Callable[[str], Any]:
-    """The format's own meshio reader; meshio.read would print and call sys.exit on an error."""
+def _read_meshio(file_format: str, path: str) -> tuple[Any, dict[int, list[int]]]:
+    """Mesh by the format's own meshio reader; meshio.read would print and call sys.exit on an error."""
     import meshio
 
-    return getattr(meshio, file_format).read
+    return getattr(meshio, file_format).read(path), {}
+
+
+def _read_gmsh(path: str) -> tuple[Any, dict[int, list[int]]]:
+    """Mesh of a gmsh file, and the physical groups of each volume of version 4.1.
+
+    meshio alone takes the first of several groups, and refuses a file with some volumes in no group.
+    """
+    from meshio.gmsh._gmsh41 import _read_entities
+
+    head, _, rest = Path(path).read_bytes().partition(b"$Entities")
+    version = re.search(rb"\$MeshFormat\s+4(?:\.1)?\s+(\d)\s+(\d+)", head)
+    if not (version and rest):
+        return _read_meshio("gmsh", path)
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder) / "part.msh"
+        scratch.write_bytes(rest)
+        with scratch.open("rb") as stream:
+            stream.readline()
+            _, _, _, groups = _read_entities(stream, version[1] == b"0", int(version[2]))[0]
+        scratch.write_bytes(head + rest.partition(b"$EndEntities")[2])
+        raw, _ = _read_meshio("gmsh", str(scratch))
+    if any(groups.values()):
+        raw.cell_data["gmsh:physical"] = [
+            # A block is of one volume.
+            np.full(len(volume), next(iter(groups[volume[0]]), 0) if block.type == "tetra" else 0)
+            for block, volume in zip(raw.cells, raw.cell_data[_GEOMETRY_KEY], strict=True)
+        ]
+    return raw, groups
+
+
+_READERS = {name: partial(_read_meshio, name) for name in FORMATS.values()} | {"gmsh": _read_gmsh}
 
 
 def _check_pieces(file: Path) -> None:
@@ -137,14 +188,54 @@ def _only_tets(file: Path, raw: Any) -> NDArray[np.integer]:
     return np.concatenate([np.asarray(block.data) for block in raw.cells if block.type == "tetra"])
 
 
-def _region_of(raw: Any) -> NDArray | None:
+def _region_of(file: Path, raw: Any, asked: str | None) -> NDArray | None:
     """Region tag of each tet in file order, shape (n_tet,); None if the file has no tags."""
-    key = next((key for key in REGION_KEYS if key in raw.cell_data), None)
-    if key is None:
-        return None
-    blocks = zip(raw.cells, raw.cell_data[key], strict=True)
-    tags = np.concatenate([np.asarray(values) for block, values in blocks if block.type == "tetra"])
-    return tags[:, 0] if tags.ndim == 2 and tags.shape[1] == 1 else tags
+    arrays = {
+        name: np.concatenate([own for block, own in zip(raw.cells, blocks, strict=True) if block.type == "tetra"])
+        for name, blocks in raw.cell_data.items()
+    }
+    tags = _tags_in(arrays)
+    if asked is None:
+        chosen = [name for name in REGION_KEYS if name in tags] or [name for name in tags if name != _GEOMETRY_KEY]
+        if len(chosen) > 1:
+            raise MeshError(
+                f"{file}: which cell data are the regions? Give cell_data (--cell-data): {', '.join(tags.values())}"
+            )
+        asked = next(iter(chosen or [name for name in REGION_KEYS if name in arrays]), None)
+        if chosen and chosen[0] not in REGION_KEYS:
+            warnings.warn(f"{file}: the regions are the cell data {tags[chosen[0]]}", stacklevel=3)
+        if not chosen and (of_nodes := _tags_in(raw.point_data)):
+            warnings.warn(
+                f"{file}: the point data {', '.join(of_nodes.values())} are left out: regions are cell data (ParaView: "
+                "Point Data to Cell Data, Categorical Data)",
+                stacklevel=3,
+            )
+        if asked is None:
+            return None
+    if asked not in arrays:
+        there = ", ".join(tags.values()) or ", ".join(arrays) or "none"
+        raise MeshError(f"{file}: has no cell data {asked!r}; there are {there}")
+    values = arrays[asked]
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
+def _tags_in(arrays: Mapping[str, NDArray]) -> dict[str, str]:
+    """Arrays of 2 to TAGS_MOST different whole numbers, each with a text such as "labels (0, 1, 2)"."""
+    tags = {}
+    for name, array in arrays.items():
+        known = np.unique(array)
+        if array.size == len(array) and 1 < len(known) <= TAGS_MOST and (known == np.rint(known)).all():
+            tags[name] = f"{name} ({', '.join(f'{tag:g}' for tag in known[:10])}{', ...' if len(known) > 10 else ''})"
+    return tags
+
+
+def _repeated(tets: NDArray[np.integer], region: NDArray | None) -> str:
+    """Remark on tets that are in the file several times, as gmsh 2.2 writes those of several groups."""
+    _, of_tet, count = np.unique(np.sort(tets, axis=1), axis=0, return_inverse=True, return_counts=True)
+    if region is None or count.max() == 1:
+        return ""
+    tags = ", ".join(map(str, region[of_tet.ravel() == np.argmax(count)]))
+    return f"; {np.count_nonzero(count > 1)} tets are there several times, one with the tags {tags}"
 
 
 def _field_data(mesh: TetMesh) -> bytes:

@@ -20,10 +20,15 @@ class Organ:
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """A label image (nii, nii.gz, nrrd, dcm); or closed surfaces (STL, OBJ, PLY), the organ first, then a file for each
-    region in it, named after the region; or one file of tets (vtu, vtk, msh, mesh)."""
+    """A label image (nii, nii.gz, nrrd, mha, dcm), or several of one grid, the organ first; or closed surfaces (STL,
+    OBJ, PLY), the organ first, then a file for each region in it, named after the region; or one file of tets (vtu,
+    vtk, msh, mesh)."""
     labels: MaybeText = None
-    """NAME=LABEL,...: the labels of an image, or the region tags of tets, the organ first, such as liver=1,lesion=2."""
+    """NAME=LABEL,...: the labels of an image by number or by their names in the file, or the region tags of tets, the
+    organ first, such as liver=1,lesion=2; of several images one each, in their order. Default: the only label of each
+    image, named after its file."""
+    cell_data: MaybeText = None
+    """Name of the cell data with the tags of tets, for files with several."""
     length_unit: MaybeText = None
     """Unit of the file: m, cm, mm, or metres per unit as a number; required if the format states none."""
     cell_size: MaybeNumber = None
@@ -77,10 +82,10 @@ class Organ:
             raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
         unit, first = unit_of(self.length_unit), self.files[0]
         if is_image(first):
-            _refuse(self, ("length_unit", "remesh"), "surfaces or tets; an image has its own")
+            _refuse(self, ("length_unit", "remesh", "cell_data"), "surfaces or tets; an image has its own")
         elif first.suffix.lower() in SURFACE_SUFFIXES:
             _refuse(self, ("labels",), "a label image or tets; regions of surfaces have a file each")
-            _refuse(self, ("remesh",), "a file of tets")
+            _refuse(self, ("remesh", "cell_data"), "a file of tets")
         elif first.suffix.lower() in FORMATS:
             _refuse(self, ("mend",), "a label image or surfaces")
             if not self.remesh:
@@ -99,6 +104,7 @@ class Organ:
                 self.files,
                 out,
                 labels=self.labels,
+                cell_data=self.cell_data,
                 length_unit=unit,
                 cell_size=self.cell_size,
                 mesher=self.mesher or patient.MESHERS[0],

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from msdm_core.mesh import FloatArray
+from msdm_core.mesh_files import checked_content
 
 NEEDED = ("site", "depth_mm", "normal_force_n")
 PLACE = ("x_mm", "y_mm", "z_mm")
@@ -76,6 +77,7 @@ def read_recording(path: Path) -> Recording:
         ValueError: an unreadable file; a column or a number that is missing, wrong or beyond any press, with file,
             line, column, value and rule.
     """
+    checked_content(path)
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream)

@@ -3,54 +3,67 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from msdm_core.arithmetic import norm
 from msdm_core.errors import MeshError
 from msdm_core.meshing import largest_part, parts_of
-from surgsim_apps.patient.label_readers import ImageGeometry, LabelSource, read_labels
+from surgsim_apps.patient.label_readers import SLACK, ImageGeometry, LabelSource, read_labels
 from surgsim_apps.patient.materials import check_name, is_lesion
+from surgsim_apps.patient.surface_files import region_name
 
-IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")
-FORM = "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2"
+IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
+FORM = (
+    "--labels NAME=LABEL,... with the organ first, such as liver=1,lesion=2 (a label is a number or a name of the file)"
+)
 # Smallest volume of a lesion over a cell's: a ball of half a cell's radius (the rule of `msdm_core.material.Lesion`).
 SMALLEST_SHARE_OF_CELL = np.pi / 6.0
 # Most lesions of a label, the largest of its parts; the others are noise.
 PARTS_MOST = 24
 # Tags are bytes, and 0 is outside.
 NAMES_MOST = 255
+# An organ that ends by itself tapers: its last slice has at most this share of the voxels of the one before. Up to half
+# for a dome, and more for a ridge; the rest is for the voxels' steps.
+TAPER = 0.6
 
 
 @dataclass(frozen=True)
 class LabelName:
-    """A tissue's name and its label in the image."""
+    """A tissue's name, and its label in the image as a number or by the file's name for it."""
 
     name: str
-    value: int
+    value: int | str
 
 
-def parse_labels(text: str) -> tuple[LabelName, ...]:
-    """Tissues of a text such as "liver=1,lesion=2", the organ first.
+def parse_labels(text: str, *, file_count: int = 1, zero_is_outside: bool = True) -> tuple[LabelName, ...]:
+    """Tissues of a text such as "liver=1,lesion=2", the organ first; of several files, one of each.
 
     Raises:
-        MeshError: a part that breaks the form, a name or a label given twice.
+        MeshError: a part that breaks the form, a name given twice, or a label given twice for one file.
     """
     names = []
     for part in text.split(","):
-        name, equals, value = part.partition("=")
-        name = name.strip()
-        if not equals or not re.fullmatch(r"\s*\d{1,10}\s*", value):
+        name, equals, value = map(str.strip, part.partition("="))
+        if not equals or not value:
             raise MeshError(f"--labels: {part!r} is no NAME=LABEL; give {FORM}")
-        if int(value) == 0:
+        number = int(value) if re.fullmatch(r"-?\d{1,10}", value) else value
+        if number == 0 and zero_is_outside:
             raise MeshError(f"--labels: {part!r}: label 0 is outside; give {FORM}")
-        names.append(LabelName(check_name(name, "--labels"), int(value)))
-    for entries in ([label.name for label in names], [label.value for label in names]):
+        names.append(LabelName(check_name(name, "--labels"), number))
+    values = [label.value for label in names] if file_count == 1 else []
+    for entries in ([label.name for label in names], values):
         twice = next((entry for entry in entries if entries.count(entry) > 1), None)
         if twice is not None:
             raise MeshError(f"--labels: {twice!r} is given twice; each tissue has one label of its own")
+    if file_count not in (1, len(names)):
+        raise MeshError(
+            f"--labels: {len(names)} labels are given for {file_count} files; give each file's, in their order"
+        )
     return tuple(names)
 
 
@@ -85,47 +98,102 @@ def is_image(file: Path) -> bool:
     return file.name.lower().endswith(IMAGE_SUFFIXES)
 
 
-def read_label_image(file: Path, labels: Sequence[LabelName]) -> LabelImage:
-    """Read the named labels of an image file.
+def read_label_image(
+    file: Path, labels: Sequence[LabelName] | None = None, *, others: Sequence[Path] = ()
+) -> LabelImage:
+    """Read the named labels of an image file, or one label from each of several; where they overlap the later applies.
+
+    Args:
+        file: the image.
+        labels: the organ's first; without them the only label of each file, named after the file.
+        others: images on the grid of the first, one for each further label.
 
     Raises:
         MeshError: a file that is missing, unreadable, sheared or not of three axes; values that are not whole numbers;
-            a label that is nowhere in it (lists those that are).
+            a label that is nowhere in it (lists those that are), or covered wholly by later ones; files of several
+            labels without `labels`; files on other grids.
     """
-    if not file.is_file():
-        raise MeshError(f"{file}: no such file; check the path (current folder: {Path.cwd()})")
-    source = read_labels(file, [label.value for label in labels])
-    tags = np.zeros(source.values.shape, dtype=np.uint8)
-    for tag, label in enumerate(labels, start=1):
-        chosen = source.values == label.value
-        if not chosen.any():
+    files = [file, *others]
+    missing = next((path for path in files if not path.is_file()), None)
+    if missing is not None:
+        raise MeshError(f"{missing}: no such file; check the path (current folder: {Path.cwd()})")
+    sources = [read_labels(path) for path in files]
+    for source in sources[1:]:
+        _check_grid(sources[0], source)
+    chosen = [_only_label(source) for source in sources] if labels is None else labels
+    return _tagged(list(zip(sources if others else sources * len(chosen), chosen, strict=True)))
+
+
+def _only_label(source: LabelSource) -> LabelName:
+    present = source.present()
+    if len(present) != 1:
+        advice = f"give {FORM}" if present else "leave it out"
+        raise MeshError(f"{source.file}: which label is it? {source.present_text}: {advice}")
+    return LabelName(region_name(source.file), present[0].value)
+
+
+def _check_grid(first: LabelSource, other: LabelSource) -> None:
+    """Refuse an image with other voxels than the first's."""
+    grids, corners = [], []
+    for source in (first, other):
+        counts = np.array(source.shape)
+        sides = " x ".join(f"{length * 1e3:.4g}" for length in source.geometry.spacing)
+        grids.append(f"{' x '.join(map(str, source.shape))} voxels of {sides} mm")
+        ends = np.array(list(product((0, 1), repeat=3))) * (counts - 1)
+        corners.append(source.geometry.places(ends * source.geometry.spacing))
+    apart = float(norm(corners[1] - corners[0], axis=1).max())
+    if first.shape != other.shape or apart > SLACK * first.geometry.spacing.min():
+        raise MeshError(
+            f"{other.file}: its grid is not that of {first.file.name}: {grids[1]} for {grids[0]}, a corner lies "
+            f"{apart * 1e3:.4g} mm apart; resample it by nearest neighbours, as SimpleITK.Resample(image, first_image, "
+            "SimpleITK.Transform(), SimpleITK.sitkNearestNeighbor) does"
+        )
+
+
+def _tagged(chosen: Sequence[tuple[LabelSource, LabelName]]) -> LabelImage:
+    """Image of labels with one grid, cropped to them; of labels that overlap the later applies, with a note."""
+    first = chosen[0][0]
+    tags, counts, notes = np.zeros(first.shape, dtype=np.uint8), [0], list[str]()
+    volume = float(np.prod(first.geometry.spacing)) * 1e6
+    for tag, (source, label) in enumerate(chosen, start=1):
+        mask = source.mask(source.segment(label.value))
+        counts.append(int(np.count_nonzero(mask)))
+        if not counts[tag]:
             raise MeshError(
-                f"{file}: label {label.value} ({label.name!r}) is nowhere in the image; there are {_there(source)}: "
+                f"{source.file}: label {label.value} ({label.name!r}) is nowhere in the image; {source.present_text}: "
                 "correct --labels"
             )
-        tags[chosen] = tag
-    return _cropped(tags, labels, source)
+        covered = np.bincount(tags[mask], minlength=tag)
+        for under in [int(tag) for tag in np.flatnonzero(covered) if tag]:
+            file, lower = chosen[under - 1]
+            counts[under] -= int(covered[under])
+            if not counts[under]:
+                raise MeshError(
+                    f"{file.file}: label {lower.value} ({lower.name!r}) is covered wholly by later ones, the last "
+                    f"{label.value} ({label.name!r}): where labels overlap the later applies; give the inner one later"
+                )
+            notes.append(
+                f"{lower.name} and {label.name} overlap in {covered[under]} voxels ({covered[under] * volume:.4g} ml): "
+                f"they are {label.name}, the later one"
+            )
+        tags[mask] = tag
+    return _cropped(tags, chosen, notes)
 
 
-def _there(source: LabelSource) -> str:
-    known = [int(value) for value in np.unique(source.values) if value]
-    dots = ", ..." if len(known) > 20 else ""
-    return f"labels {', '.join(map(str, known[:20]))}{dots}" if known else "no labels at all, every voxel is 0"
-
-
-def _cropped(tags: NDArray[np.uint8], labels: Sequence[LabelName], source: LabelSource) -> LabelImage:
+def _cropped(tags: NDArray[np.uint8], chosen: Sequence[tuple[LabelSource, LabelName]], notes: list[str]) -> LabelImage:
     box = []
     for axis in range(3):
         used = np.flatnonzero(tags.any(axis=tuple({0, 1, 2} - {axis})))
         box.append(slice(int(used[0]), int(used[-1]) + 1))
     x, y, z = (span.start for span in box)
+    stated = dict.fromkeys(f"{source.file.name}: {note}" for source, _ in chosen for note in source.notes)
     return LabelImage(
         np.ascontiguousarray(tags[tuple(box)]),
-        tuple(label.name for label in labels),
-        source.geometry.moved(np.array([x, y, z], dtype=np.float64)),
+        tuple(label.name for _, label in chosen),
+        chosen[0][0].geometry.moved(np.array([x, y, z], dtype=np.float64)),
         (x, y, z),
-        source.values.shape,
-        source.notes,
+        chosen[0][0].shape,
+        (*stated, *notes),
     )
 
 
@@ -201,14 +269,21 @@ def _one_part(image: LabelImage) -> tuple[NDArray[np.uint8], list[str]]:
 
 
 def _at_border(tags: NDArray[np.uint8], image: LabelImage) -> list[str]:
+    """Notes on sides where the organ ends with the image without tapering, so that it may go on outside.
+
+    An image cropped to its labels, as by 3D Slicer, or without empty slices, as in DICOM, touches them at all sides.
+    """
     notes = []
     for axis in range(3):
-        used = np.flatnonzero(tags.any(axis=tuple({0, 1, 2} - {axis}))) + image.corner[axis]
-        for touches, high in ((used[0] == 0, False), (used[-1] == image.shape[axis] - 1, True)):
-            if touches:
+        counts = np.count_nonzero(tags, axis=tuple({0, 1, 2} - {axis}))
+        used, spacing = np.flatnonzero(counts), np.delete(image.geometry.spacing, axis)
+        for edge, step, border, high in ((used[0], 1, 0, False), (used[-1], -1, image.shape[axis] - 1, True)):
+            before = counts[edge + step] if len(used) > 1 else 0
+            if edge + image.corner[axis] == border and counts[edge] > TAPER * before:
+                area_cm2 = counts[edge] * float(np.prod(spacing)) * 1e4
                 notes.append(
-                    f"the organ touches the image's border towards the {image.geometry.side(axis, high=high)}: it is "
-                    "cut off there, and ends in a flat face"
+                    f"the organ touches the image's border towards the {image.geometry.side(axis, high=high)} with a "
+                    f"flat face of {area_cm2:.3g} cm^2: it is cut off there, unless that is its shape"
                 )
     return notes
 

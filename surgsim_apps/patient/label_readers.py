@@ -1,9 +1,13 @@
 """Readers of label images in NIfTI, NRRD, MetaImage and DICOM: geometry in the patient, and voxels."""
 
-from collections.abc import Sequence
+import contextlib
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import arccos, matmul, norm, svd
 from msdm_core.errors import MeshError
 from msdm_core.mesh import FloatArray
-from msdm_core.mesh_files import parsed
+from msdm_core.mesh_files import metres_per_unit, parsed
 
 # The axes of a scan's mesh, in words.
 CONVENTION = "x to the patient's left, y to the back, z to the head (LPS, as DICOM), metres, the scanner's own origin"
@@ -22,11 +26,15 @@ SPACING_RANGE = (1e-5, 0.05)
 AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
 # NIfTI's axes are RAS: x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
+NRRD_SUFFIXES = (".nrrd", ".nhdr")
 METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
-# Largest distance of frames off the grid, over the slice step, or over 1 mm for thinner slices.
+# Largest distance of frames off the grid, over the slice step, or over 1 mm for thinner slices; and largest difference
+# of two statements of a header about one length, over the voxels' spacing.
 SLACK = 0.02
+# Largest distance of labels in floats from whole numbers, and largest relative difference of pixels: rounding.
+ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,47 +99,133 @@ class ImageGeometry:
         return AXES[main][int((along[main] > 0) == high)]
 
 
+@dataclass(frozen=True)
+class Segment:
+    """Label of a file.
+
+    Fields:
+        value: of its voxels; of a DICOM segmentation the segment's number
+        names: in the file, that for messages first
+        layer: of its voxels, in an image of several layers
+    """
+
+    value: int
+    names: tuple[str, ...] = ()
+    layer: int | None = None
+
+    def __str__(self) -> str:
+        """The label in one line."""
+        name = " ".join(self.names[0].split())[:40] if self.names else ""
+        if self.layer is not None:
+            return f"{name}: layer {self.layer}, value {self.value}"
+        return f"{self.value} ({name})" if name else f"{self.value}"
+
+
 @dataclass(frozen=True, eq=False)
 class LabelSource:
     """Contents of an image file.
 
     Fields:
         file: its path
-        values: of its voxels                                   (n_x, n_y, n_z)
+        shape: its voxel counts                                 (3,)
         geometry: spacing, directions and origin
-        notes: assumptions about the header, for the report
+        stated: labels that the header describes
+        present: the labels that voxels have
+        mask: true at a label's voxels                          (n_x, n_y, n_z)
+        notes: assumptions about the header and the values, for the report
     """
 
     file: Path
-    values: NDArray
+    shape: tuple[int, int, int]
     geometry: ImageGeometry
+    stated: tuple[Segment, ...]
+    present: Callable[[], Sequence[Segment]]
+    mask: Callable[[Segment], NDArray[np.bool_]]
     notes: tuple[str, ...] = ()
 
+    @classmethod
+    def from_values(
+        cls,
+        file: Path,
+        values: NDArray,
+        geometry: ImageGeometry,
+        stated: tuple[Segment, ...] = (),
+        notes: Iterable[str] = (),
+        *,
+        slope: float = 0.0,
+    ) -> "LabelSource":
+        """Image with a number for each voxel (n_x, n_y, n_z), or one for each layer (n_x, n_y, n_z, n_layer).
 
-def read_labels(file: Path, wanted: Sequence[int]) -> LabelSource:
+        Args:
+            file: its path.
+            values: of the voxels.
+            geometry: spacing, directions and origin.
+            stated: labels that the header describes.
+            notes: assumptions about the header.
+            slope: value of a step of the stored integers; 0 for values that are stored as they are.
+
+        Raises:
+            MeshError: values that are no whole numbers.
+        """
+        whole, deviations = _whole_numbers(values, slope, file)
+
+        def present() -> Sequence[Segment]:
+            if whole.ndim == 4:
+                return stated
+            known = {segment.value: segment for segment in stated}
+            return [known.get(int(value), Segment(int(value))) for value in np.unique(whole) if value]
+
+        def mask(segment: Segment) -> NDArray[np.bool_]:
+            return (whole if whole.ndim == 3 else whole[..., segment.layer or 0]) == segment.value
+
+        x, y, z = whole.shape[:3]
+        return cls(file, (x, y, z), geometry, stated, present, mask, (*notes, *deviations))
+
+    @property
+    def present_text(self) -> str:
+        """The labels that voxels have, at most 20 of them, for messages."""
+        known = self.present()
+        dots = ", ..." if len(known) > 20 else ""
+        separator = "; " if any(segment.layer is not None for segment in known) else ", "
+        text = separator.join(map(str, known[:20]))
+        return f"there are labels {text}{dots}" if known else "there are no labels at all, every voxel is 0"
+
+    def segment(self, label: int | str) -> Segment:
+        """The label with a number or a name of the file.
+
+        Raises:
+            MeshError: a name that no label has, or several labels with the name or number.
+        """
+        fits = [segment for segment in self.stated if label == segment.value or label in segment.names]
+        if len(fits) == 1:
+            return fits[0]
+        if fits:
+            raise MeshError(
+                f"{self.file}: label {label} is that of {len(fits)} segments ({'; '.join(map(str, fits))}): choose by "
+                "the file's names in --labels, such as liver=NAME"
+            )
+        if isinstance(label, str):
+            raise MeshError(f"{self.file}: no label is called {label!r}; {self.present_text}: correct --labels")
+        return Segment(label)
+
+
+def read_labels(file: Path) -> LabelSource:
     """Read an image file by its suffix.
-
-    Args:
-        file: the file.
-        wanted: segment numbers of a DICOM segmentation; of overlapping segments the later in this list applies.
 
     Raises:
         MeshError: an unreadable file, an image that is sheared or not of three axes, voxels that are no whole numbers.
     """
-    return parsed(file, lambda _: _read(file, wanted), "export or copy it again")
+    return parsed(file, lambda _: _read(file), "export or copy it again")
 
 
-def _read(file: Path, wanted: Sequence[int]) -> LabelSource:
+def _read(file: Path) -> LabelSource:
     try:
         if file.name.lower().endswith((".nii", ".nii.gz")):
-            source = _read_nifti(file)
-        else:
-            segmentation = _read_segmentation(file, wanted) if file.suffix.lower() == ".dcm" else None
-            source = segmentation or _read_itk(file)
+            return _read_nifti(file)
+        segmentation = _read_segmentation(file) if file.suffix.lower() == ".dcm" else None
+        return segmentation or _read_itk(file)
     except ImportError as error:
         raise MeshError(f"{file}: reading it needs {error.name}: pip install 'surgsim[patient]'") from None
-    check_whole(source.values, file)
-    return source
 
 
 def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
@@ -151,40 +245,96 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
     return counts[0], counts[1], counts[2]
 
 
-def check_whole(values: NDArray, file: Path) -> None:
-    """Refuse values that are no whole numbers."""
+def _whole_numbers(values: NDArray, slope: float, file: Path) -> tuple[NDArray, list[str]]:
+    """Values rounded to whole numbers, and a note on the largest change.
+
+    Integers stored with a slope deviate by up to half of it, floats by their rounding.
+
+    Raises:
+        MeshError: other values.
+    """
     if values.dtype.kind not in "iubf":
         raise MeshError(f"{file}: the image's values are {values.dtype}; labels are whole numbers: export a label map")
     if values.dtype.kind != "f":
-        return
-    # numpy warns of signalling NaNs; all are wrong here.
+        return values, []
+    # From a slope of 1 on, neighbouring labels have the same stored number.
+    slack = max(ROUNDING, 0.5 * slope if slope < 1.0 else 0.0)
+    # numpy warns of NaNs and infinities; all are wrong here.
     with np.errstate(invalid="ignore"):
-        wrong = (values != np.rint(values)) | ~np.isfinite(values)
+        whole = np.rint(values)
+        deviation = np.abs(values - whole)
+        wrong = ~(deviation <= slack * (1.0 + 1e-6))
+    stored = f", stored as integers with a slope of {slope:.4g}," if slope else ""
     if wrong.any():
         raise MeshError(
-            f"{file}: the image holds {float(values[wrong][0]):g}, which is no whole number: labels are; is this the "
-            "scan itself, or resampled with interpolation? Export a label map, resampled by nearest neighbours"
+            f"{file}: the image{stored} holds {float(values[wrong][0]):.7g}, which is no whole number: labels are; is "
+            "this the scan itself, or resampled with interpolation? Export a label map of integers, resampled by "
+            "nearest neighbours"
         )
+    largest = float(deviation.max(initial=0.0))
+    return (
+        (whole, [f"the labels{stored} are up to {largest:.2g} off whole numbers: rounded"]) if largest else (values, [])
+    )
 
 
 def _read_nifti(file: Path) -> LabelSource:
     import nibabel
 
+    with file.open("rb") as stream:
+        if file.suffix.lower() == ".nii" and stream.read(2) == b"\x1f\x8b":
+            raise MeshError(f"{file}: is compressed by gzip: rename it {file.name}.gz")
     image: Any = nibabel.load(file)
     header, notes = image.header, []
     shape = checked_shape(image.shape, file)
     unit = str(header.get_xyzt_units()[0])
     if unit not in METRES:
         notes.append("the header states no length unit: millimetres are assumed, as NIfTI's readers do")
-    if not int(header["sform_code"]) and not int(header["qform_code"]):
+    metres = METRES.get(unit, 1e-3)
+    if int(header["sform_code"]):
+        notes += _other_places(header, image.affine, shape, metres * 1e3)
+    elif not int(header["qform_code"]):
         notes.append("the header states no orientation: left and right, front and back may be swapped")
-    matrix, origin = np.hsplit(matmul(RAS_TO_LPS, image.affine[:3] * METRES.get(unit, 1e-3)), [3])
+    matrix, origin = np.hsplit(matmul(RAS_TO_LPS, image.affine[:3] * metres), [3])
     geometry = ImageGeometry.from_matrix(matrix, origin[:, 0], file)
-    return LabelSource(file, np.asanyarray(image.dataobj).reshape(shape), geometry, tuple(notes))
+    values = np.asanyarray(image.dataobj).reshape(shape)
+    slope = abs(float(image.dataobj.slope)) if image.get_data_dtype().kind in "iu" else 0.0
+    return LabelSource.from_values(file, values, geometry, _label_table(header.extensions), notes, slope=slope)
+
+
+def _other_places(header: Any, sform: FloatArray, shape: Sequence[int], unit_mm: float) -> list[str]:
+    """Note on a NIfTI header whose qform, or pixdim without one, gives other places than its sform, which applies."""
+    spacing, pixdim = norm(sform[:3, :3], axis=0), np.abs(header["pixdim"][1:4])
+    try:
+        by_qform = int(header["qform_code"]) > 0
+        other = header.get_qform() if by_qform else sform * np.append(pixdim / spacing, 1.0)
+    except ValueError as error:
+        return [f"the header's qform is no rotation ({error}): its sform is used"]
+    corners = np.array(list(product(*((0, count - 1) for count in shape), (1,))), dtype=np.float64)
+    apart = float(norm(matmul(corners, (other - sform).T), axis=1).max())
+    if apart <= SLACK * spacing.min():
+        return []
+    sides = [" x ".join(f"{length * unit_mm:.5g}" for length in lengths) for lengths in (spacing, pixdim)]
+    return [
+        f"the header's sform (voxels of {sides[0]} mm) and {'qform' if by_qform else 'pixdim'} ({sides[1]} mm) differ: "
+        f"a corner of the image lies {apart * unit_mm:.4g} mm apart in them; the sform is used"
+    ]
+
+
+def _label_table(extensions: Iterable[Any]) -> tuple[Segment, ...]:
+    """Labels of the XML table that Connectome Workbench and TotalSegmentator write into NIfTI headers."""
+    for extension in extensions:
+        content = extension.get_content()
+        text = content.decode(errors="replace") if isinstance(content, bytes) else str(content)
+        if "<LabelTable" in text:
+            # Names only help: a broken table is as good as none.
+            with contextlib.suppress(ElementTree.ParseError, ValueError):
+                labels = ElementTree.fromstring(text.strip("\0 \n")).iter("Label")
+                return tuple(Segment(int(label.get("Key", "")), (label.text or "",)) for label in labels)
+    return ()
 
 
 def _read_itk(file: Path) -> LabelSource:
-    """Read an NRRD, MetaImage or DICOM image."""
+    """Read an NRRD, MetaImage or DICOM image; several numbers a voxel are layers of 3D Slicer's segments."""
     import SimpleITK
 
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
@@ -192,21 +342,53 @@ def _read_itk(file: Path) -> LabelSource:
     reader.SetFileName(str(file))
     reader.ReadImageInformation()
     shape = checked_shape(reader.GetSize(), file)
+    header: dict[str, str] = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
     components = reader.GetNumberOfComponents()
-    if components != 1:
+    stated = _slicer_segments(header, layered=components > 1)
+    if components > 1 and not stated:
         raise MeshError(f"{file}: each voxel has {components} numbers; the rule is one label: export one layer of it")
+    if not all(0 <= (segment.layer or 0) < components for segment in stated):
+        raise MeshError(f"{file}: its segments ({'; '.join(map(str, stated))}) name layers, but it has {components}")
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
-    matrix = direction * np.array(reader.GetSpacing()[:3]) * 1e-3
-    geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * 1e-3, file)
+    metres = 1e-3 if file.suffix.lower() not in NRRD_SUFFIXES else _nrrd_unit(file)
+    matrix = direction * np.array(reader.GetSpacing()[:3]) * metres
+    geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * metres, file)
     notes: tuple[str, ...] = ()
-    if file.suffix.lower() == ".nrrd" and not reader.HasMetaDataKey("NRRD_space"):
+    if file.suffix.lower() in NRRD_SUFFIXES and "NRRD_space" not in header:
         notes = ("the header names no anatomical space: left, back and up (LPS) are assumed",)
-    # SimpleITK's arrays have the axes reversed.
-    return LabelSource(file, SimpleITK.GetArrayFromImage(reader.Execute()).T.reshape(shape), geometry, notes)
+    # SimpleITK's arrays have the axes reversed, but the layers last.
+    values = SimpleITK.GetArrayFromImage(reader.Execute())
+    values = np.moveaxis(values.T, 0, -1).reshape(*shape, -1) if components > 1 else values.T.reshape(shape)
+    # RescaleSlope (DICOM PS3.6).
+    slope = abs(float(header.get("0028|1053", 0.0)))
+    return LabelSource.from_values(file, values, geometry, stated, notes, slope=slope)
 
 
-def _read_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
+def _nrrd_unit(file: Path) -> float:
+    """Metres per unit of an NRRD file's space, millimetres if it states none; SimpleITK reads no units."""
+    with file.open("rb") as stream:
+        head = b"".join(iter(lambda: stream.readline().strip(), b""))
+    units = re.search(rb'space units:((?:\s*"[^"]*")+)', head)
+    stated = set(re.findall(r'"([^"]*)"', units[1].decode(errors="replace")) if units else ())
+    if len(stated) > 1:
+        raise MeshError(f"{file}: its axes have units {', '.join(sorted(stated))}; the rule is one: export it again")
+    return metres_per_unit(stated.pop()) if stated else 1e-3
+
+
+def _slicer_segments(header: dict[str, str], *, layered: bool) -> tuple[Segment, ...]:
+    """Segments of 3D Slicer's NRRD header; the oldest files have one in each layer, as 1."""
+    numbers = sorted({int(match[1]) for match in map(re.compile(r"Segment(\d+)_").match, header) if match})
+    segments = []
+    for number in numbers:
+        key = f"Segment{number}"
+        names = [header[f"{key}_{field}"] for field in ("Name", "ID") if f"{key}_{field}" in header]
+        layer = int(header.get(f"{key}_Layer", number)) if layered else None
+        segments.append(Segment(int(header.get(f"{key}_LabelValue", 1)), (*names, key), layer))
+    return tuple(segments)
+
+
+def _read_segmentation(file: Path) -> LabelSource | None:
     """Read a DICOM segmentation; None for another DICOM file."""
     import pydicom
 
@@ -214,70 +396,119 @@ def _read_segmentation(file: Path, wanted: Sequence[int]) -> LabelSource | None:
     if str(data.get("SOPClassUID", "")) not in CLASSES:
         return None
     kind = str(data.SegmentationType)
-    if kind not in ("BINARY", "LABELMAP"):
-        raise MeshError(f"{file}: its segments are {kind:.80}; the rule is BINARY or LABELMAP: export it so")
-    segments = {int(segment.SegmentNumber): str(segment.SegmentLabel) for segment in data.SegmentSequence}
-    missing = [number for number in wanted if number not in segments]
-    if missing:
-        there = ", ".join(f"{number} ({name!r})" for number, name in sorted(segments.items())[:20])
-        raise MeshError(f"{file}: segment {missing[0]} is nowhere in it; there are {there}: correct --labels")
-    frames = list(data.PerFrameFunctionalGroupsSequence)
+    if kind not in ("BINARY", "FRACTIONAL", "LABELMAP"):
+        raise MeshError(
+            f"{file}: its segments are {kind:.80}; the rule is BINARY, FRACTIONAL or LABELMAP: export it so"
+        )
+    segments = tuple(Segment(int(entry.SegmentNumber), (str(entry.SegmentLabel),)) for entry in data.SegmentSequence)
+    frames = list(data.get("PerFrameFunctionalGroupsSequence", ()))
     rows, columns = int(data.Rows), int(data.Columns)
-    geometry, slices = _geometry(file, data, frames)
-    values = np.zeros(checked_shape((columns, rows, int(slices.max()) + 1), file), dtype=np.int32)
+    geometry, slices, notes = _geometry(file, data, frames)
+    shape = checked_shape((columns, rows, int(slices.max()) + 1), file)
     pixels = np.atleast_3d(data.pixel_array).reshape(len(frames), rows, columns)
-    if kind == "LABELMAP":
-        for frame, place in enumerate(slices):
-            values[..., place] = pixels[frame].T
-        return LabelSource(file, values, geometry)
-    groups = [_group(data, frame, "SegmentIdentificationSequence") for frame in frames]
-    numbers = np.array([int(group.ReferencedSegmentNumber) for group in groups])
-    for number in wanted:
-        for frame in np.flatnonzero(numbers == number):
-            values[pixels[frame].T > 0, slices[frame]] = number
-    return LabelSource(file, values, geometry)
+    numbers = np.zeros(len(frames), dtype=np.int64)
+    if kind != "LABELMAP":
+        groups = [_group(data, frame, "SegmentIdentificationSequence") for frame in frames]
+        numbers = np.array([int(group.ReferencedSegmentNumber) for group in groups])
+    repeated = len(frames) - len(set(zip(numbers.tolist(), slices.tolist(), strict=True)))
+    if repeated:
+        raise MeshError(f"{file}: {repeated} of its frames repeat a slice; the rule is one for each: export it again")
+    smallest = 0.5
+    if kind == "FRACTIONAL":
+        most = int(data.MaximumFractionalValue)
+        smallest = 0.5 * most
+        text = f"the segments are fractions ({data.get('SegmentationFractionalType')}) of {most}"
+        if pixels.max() < smallest:
+            raise MeshError(f"{file}: {text}, and no voxel has half of that: the largest value is {pixels.max()}")
+        notes.append(f"{text}: voxels of at least half of that are taken")
+
+    def present() -> Sequence[Segment]:
+        return [segment for segment in segments if mask(segment).any()]
+
+    def mask(segment: Segment) -> NDArray[np.bool_]:
+        inside = np.zeros(shape, dtype=bool)
+        for frame in np.flatnonzero((numbers == segment.value) | (kind == "LABELMAP")):
+            own = pixels[frame].T
+            inside[..., slices[frame]] = own == segment.value if kind == "LABELMAP" else own >= smallest
+        return inside
+
+    return LabelSource(file, shape, geometry, segments, present, mask, tuple(notes))
 
 
 def _group(data: Any, frame: Any, name: str) -> Any:
-    """First item of a functional group: the frame's own, else that of all frames."""
-    return (frame if name in frame else data.SharedFunctionalGroupsSequence[0])[name][0]
+    """First item of a functional group: the frame's own, else that of all frames; None without one."""
+    shared = data.get("SharedFunctionalGroupsSequence") or [{}]
+    return (frame.get(name) or shared[0].get(name) or [None])[0]
 
 
-def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeometry, NDArray[np.int64]]:
-    """Geometry of the stack, and slice of each frame (n_frame,)."""
+def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeometry, NDArray[np.int64], list[str]]:
+    """Geometry of the stack, slice of each frame (n_frame,), and notes on the header."""
     planes = [_group(data, frame, "PlaneOrientationSequence") for frame in frames]
-    turns = {tuple(map(float, plane.ImageOrientationPatient)) for plane in planes}
-    measures = _group(data, frames[0], "PixelMeasuresSequence")
-    if len(turns) != 1:
-        raise MeshError(
-            f"{file}: its frames have {len(turns)} orientations; the rule is one stack of parallel slices: resample it"
-        )
-    turn = np.array(turns.pop()).reshape(2, 3)
-    normal = np.cross(turn[0], turn[1])
     positions = [_group(data, frame, "PlanePositionSequence") for frame in frames]
+    if not frames or None in planes or None in positions:
+        raise MeshError(
+            f"{file}: its frames have no place in the patient, as of a microscope or an X-ray projection: the rule is "
+            "a stack of slices: give a segmentation of CT or MR"
+        )
+    turns = np.array([plane.ImageOrientationPatient for plane in planes], dtype=float)
+    if np.ptp(turns, axis=0).max() > COSINE_LARGEST:
+        raise MeshError(
+            f"{file}: its frames have {len(np.unique(turns, axis=0))} orientations; the rule is one stack of parallel "
+            "slices: resample it"
+        )
+    measures = [_group(data, frame, "PixelMeasuresSequence") for frame in frames]
+    sizes = np.array([measure.PixelSpacing for measure in measures], dtype=float)
+    if np.ptp(sizes, axis=0).max() > ROUNDING * sizes.min():
+        raise MeshError(
+            f"{file}: its frames have pixels of {len(np.unique(sizes, axis=0))} sizes; the rule is one grid: resample "
+            "it onto one"
+        )
+    turn = turns[0].reshape(2, 3)
+    normal = np.cross(turn[0], turn[1])
     places = np.array([position.ImagePositionPatient for position in positions], dtype=float)
     along = matmul(places, normal)
-    step = _slice_step(file, along, measures)
+    step, notes = _slice_step(file, along, measures[0])
     slices = np.rint((along - along.min()) / step).astype(np.int64)
     first = places[int(np.argmin(along))]
     off = norm(places - first - slices[:, None] * step * normal, axis=1)
     if off.max() > SLACK * max(step, 1.0):
         raise MeshError(
             f"{file}: a frame lies {off.max():.3g} mm off an even stack of {step:.4g} mm slices: sheared or uneven "
-            "stacks are refused: resample it onto right-angled axes"
+            "stacks and tiles are refused: resample it onto right-angled axes"
         )
-    row_spacing, column_spacing = map(float, measures.PixelSpacing)
+    row_spacing, column_spacing = sizes[0]
     matrix: FloatArray = np.column_stack([turn[0] * column_spacing, turn[1] * row_spacing, normal * step]) * 1e-3
-    return ImageGeometry.from_matrix(matrix, first * 1e-3, file), slices
+    return ImageGeometry.from_matrix(matrix, first * 1e-3, file), slices, notes
 
 
-def _slice_step(file: Path, along: FloatArray, measures: Any) -> float:
-    """Distance between slices [mm] by the frames' positions along the normal [mm]; of a single slice as stated."""
-    apart = np.diff(np.unique(np.round(along, 3)))
-    if len(apart):
-        # The mean over the stack is free of the positions' rounding.
-        return float(np.ptp(along) / max(round(np.ptp(along) / apart.min()), 1))
-    stated = measures.get("SpacingBetweenSlices") or measures.get("SliceThickness")
-    if stated is None:
-        raise MeshError(f"{file}: has one slice and states no thickness: export it with SliceThickness")
-    return float(stated)
+def _slice_step(file: Path, along: FloatArray, measures: Any) -> tuple[float, list[str]]:
+    """Distance between slices [mm] of frames at positions along the normal [mm], and notes where statements differ.
+
+    Writers leave out empty frames: the positions alone give a multiple of the step where no two frames are neighbours.
+    """
+    spacing = float(measures.get("SpacingBetweenSlices") or 0.0)
+    thickness = float(measures.get("SliceThickness") or 0.0)
+    apart, extent = np.diff(np.unique(np.round(along, 3))), float(np.ptp(along))
+    if not len(apart):
+        if not (spacing or thickness):
+            raise MeshError(f"{file}: has one slice and states no thickness: export it with SliceThickness")
+        return spacing or thickness, []
+    nearest = float(apart.min())
+    # The mean over the stack is free of the positions' rounding.
+    step = extent / max(round(extent / nearest), 1)
+    name, stated = ("SpacingBetweenSlices", spacing) if spacing else ("SliceThickness", thickness)
+    text = f"neighbouring frames lie {nearest:.4g} mm apart, and the header states {name} {stated:.4g} mm"
+    counts = np.maximum(np.rint(apart / spacing), 1.0) if spacing else np.ones(1)
+    if counts.min() > 1.0 and (np.abs(apart / spacing - counts) <= SLACK).all():
+        even = len(apart) > 1 and np.ptp(apart) <= SLACK * nearest
+        if not even:
+            return extent / round(extent / spacing), [f"{text}: the slices between them are taken as empty"]
+        # Two statements outweigh one.
+        if abs(thickness - step) > SLACK * step:
+            raise MeshError(
+                f"{file}: {text}: slices are missing between all of them, or the header is wrong; export it with all "
+                "slices, or with the right SpacingBetweenSlices"
+            )
+    # Slices may overlap: a thickness above the step is no contradiction.
+    differs = abs(stated - step) > SLACK * step if spacing else 0.0 < stated < (1.0 - SLACK) * step
+    return step, [f"{text}: the former is used"] if differs else []

@@ -17,7 +17,7 @@ from surgsim_apps.palpate.scene_options import SceneOptions, check_options
 from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.patient.facing import facing_approach
 from surgsim_apps.patient.fine_surface import SurfaceFit, surface_file
-from surgsim_apps.patient.label_image import FORM, LabelImage, is_image, parse_labels, read_label_image
+from surgsim_apps.patient.label_image import LabelImage, is_image, parse_labels, read_label_image
 from surgsim_apps.patient.materials import is_lesion, organ_material
 from surgsim_apps.patient.meshers import (
     Cells,
@@ -52,6 +52,7 @@ def make_patient(
     out: Path,
     *,
     labels: str | None = None,
+    cell_data: str | None = None,
     length_unit: LengthUnit | None = None,
     cell_size: float | None = None,
     mesher: str = MESHERS[0],
@@ -64,9 +65,12 @@ def make_patient(
     """Meshed organ with its palpation scene.
 
     Args:
-        files: a label image; or closed surfaces, the organ's first, then one for each region; or one file of tets.
+        files: a label image, or one for each tissue, the organ's first; or closed surfaces, the organ's first, then one
+            for each region; or one file of tets.
         out: path of the mesh to be written; its stem names the scene.
-        labels: tissues of an image's labels or of the tags of tets, as in `parse_labels`.
+        labels: tissues of an image's labels or of the tags of tets, as in `parse_labels`; of several images
+            one each; default: the only label of each image.
+        cell_data: name of the array with the tags of tets.
         length_unit: of surfaces.
         cell_size: of the lattice, the same everywhere [m], from which the tip follows; default: cells follow from the
             tip, fine at the pressed face.
@@ -88,20 +92,21 @@ def make_patient(
     check_options(options)
     if cell_size is not None and not 0.0 < cell_size < math.inf:
         raise ValueError(f"cell_size is {cell_size:g}; the rule is a positive length in metres")
-    first = files[0]
+    first, source = files[0], ", ".join(file.name for file in files)
     if is_image(first):
-        if len(files) > 1:
-            raise ValueError(f"{first}: one image is taken, {len(files)} files are given")
-        if labels is None:
-            raise ValueError(f"{first}: which labels are the organ? Give {FORM}")
-        with progress.step(f"reading {first.name}"):
-            contents = read_label_image(first, parse_labels(labels))
+        wrong = [file for file in files if not is_image(file)]
+        if wrong:
+            raise ValueError(f"{wrong[0]}: is no label image; beside {first} only other label images are taken")
+        named = parse_labels(labels, file_count=len(files)) if labels is not None else None
+        with progress.step(f"reading {source}"):
+            contents = read_label_image(first, named, others=files[1:])
         name, volume = contents.names[0], image_volume(contents)
     elif first.suffix.lower() in FORMATS:
         if len(files) > 1:
             raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
         with progress.step(f"reading {first.name}"):
-            contents = read_tets(first, length_unit, parse_labels(labels) if labels is not None else ())
+            tags = parse_labels(labels, zero_is_outside=False) if labels is not None else ()
+            contents = read_tets(first, length_unit, tags, cell_data)
             if remesh:
                 contents = surfaces_of_tets(contents)
         name = contents.organ.name if isinstance(contents, PatientSurfaces) else contents.names[0]
@@ -131,10 +136,10 @@ def make_patient(
         # The lesions decide the probe's approach, and that the place of the fine cells.
         with progress.step("turning the probe to the lesions"):
             rough = replace(cells, size=touch.coarsening * touch.cell_size, is_given=True, coarsening=1)
-            approach = facing_approach(_meshed(contents, first.name, rough, mesher, mend), approach, angle)
+            approach = facing_approach(_meshed(contents, source, rough, mesher, mend), approach, angle)
         options, cells = replace(options, approach=approach), replace(cells, approach=approach)
     with progress.step("filling it with tets"):
-        mesh = _meshed(contents, first.name, cells, mesher, mend)
+        mesh = _meshed(contents, source, cells, mesher, mend)
     with progress.step("fitting its own surface to the tets"):
         mesh = replace(mesh, surface=_own_surface(contents, mesh, mend))
     with progress.step("choosing sites, lesions and the step"):

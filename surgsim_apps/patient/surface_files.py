@@ -1,8 +1,10 @@
 """Surfaces of an organ and its regions from STL, OBJ and PLY files, and the voxels inside them."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh import FloatArray, check_surface, line_hits, merge_vertices, surface_volume
-from msdm_core.mesh_files import LengthUnit
+from msdm_core.mesh_files import LengthUnit, metres_per_unit
 from surgsim_apps.patient.materials import check_name, is_lesion
 
 Triangles = NDArray[np.int64]
@@ -47,8 +49,9 @@ class BrokenSurface:
 
 
 def region_name(file: Path) -> str:
-    """Name of a region: the stem of its file, with underscores for characters outside names."""
-    kept = re.sub(r"[^A-Za-z0-9_ .-]", "_", file.stem)[:40]
+    """Name of a region: the file's name without extensions, with underscores for characters outside names."""
+    stem = re.sub(r"(\.seg)?\.(nii\.gz|[^.]*)$", "", file.name, flags=re.IGNORECASE)
+    kept = re.sub(r"[^A-Za-z0-9_ .-]", "_", stem)[:40]
     return check_name(kept.strip(" .-") or "organ", str(file))
 
 
@@ -64,19 +67,43 @@ def read_organ_surface(
 
     vertices, triangles = read_surface(file, length_unit=length_unit)
     bodies, name = bodies_of(vertices, triangles.astype(np.int64)), region_name(file)
-    notes = []
-    if len(bodies) > 1 and not mend:
-        volumes = ", ".join(f"{abs(surface_volume(*body)) * 1e6:.3g}" for body in bodies[1:6])
-        notes.append(
-            f"{file.name}: {len(bodies) - 1} surface(s) apart from the largest were left out ({volumes}"
-            f"{', ...' if len(bodies) > 6 else ''} ml)"
-        )
     try:
-        return ClosedSurface(name, *check_surface(*bodies[0])), notes
+        closed = ClosedSurface(name, *check_surface(*bodies[0]))
+        return closed, _left_out(file, bodies, metres_per_unit(length_unit)) if len(bodies) > 1 else []
     except MeshError as error:
         if not mend:
             raise MeshError(f"{file}: {error}; or --mend rebuilds it from voxels") from None
-        return BrokenSurface(name, *merge_vertices(vertices, triangles), fault=str(error)), notes
+        return BrokenSurface(name, *merge_vertices(vertices, triangles), fault=str(error)), []
+
+
+def _left_out(file: Path, bodies: Sequence[tuple[FloatArray, Triangles]], metres: float) -> list[str]:
+    """Note on the bodies beside the first: names in the file, inside or outside of it, volumes."""
+    import trimesh
+
+    split: dict[str, Any] = {"split_objects": True, "split_groups": True}
+    solids = trimesh.load_scene(file, process=False, skip_materials=True, **split).geometry
+    names = ["nameless"] * len(bodies)
+    for name, solid in solids.items() if len(solids) > 1 else ():
+        place = solid.vertices[solid.faces[0, 0]] * metres
+        distances = [np.square(vertices - place).sum(axis=1).min() for vertices, _ in bodies]
+        names[int(np.argmin(distances))] = repr(name)
+    shown = []
+    for name, body in list(zip(names, bodies, strict=True))[1:6]:
+        side = "inside" if _is_inside(body[0][0], *bodies[0]) else "outside"
+        shown.append(f"{name}, {side} it, {abs(surface_volume(*body)) * 1e6:.3g} ml")
+    return [
+        f"{file.name}: {len(bodies) - 1} surface(s) beside the largest ({names[0]}) were left out: {'; '.join(shown)}"
+        f"{'; ...' if len(bodies) > 6 else ''}; to make one a region, save it alone, named after the region, and give "
+        f"both: surgsim organ {file.name} NAME{file.suffix}"
+    ]
+
+
+def _is_inside(point: FloatArray, vertices: FloatArray, triangles: Triangles) -> bool:
+    """True for a point (3,) inside a closed surface, by the crossings of a line along z."""
+    apart = vertices - point
+    # Of the lines at even coordinates only that through the point is near.
+    u, v, w = (apart / np.abs(apart).max() + SHIFT).T
+    return bool(np.count_nonzero(line_hits(u, v, w, triangles, 0)[2] > 0) % 2)
 
 
 def read_region_surfaces(file: Path, length_unit: LengthUnit, name: str) -> list[ClosedSurface]:

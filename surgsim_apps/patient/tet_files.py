@@ -1,5 +1,6 @@
 """Patient's organ from a file of tets: the tets as they are, or their surfaces, to be filled anew."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from msdm_core.mesh import (
     merge_vertices,
     outward_facing,
     surface_cell,
+    used_nodes,
 )
 from msdm_core.mesh_files import LengthUnit
 from surgsim_apps.patient.label_image import LabelName
@@ -33,10 +35,12 @@ class PatientTets:
     Fields:
         mesh: tags from 1 on, the organ's own first, all of them named; in metres
         source: name of the file
+        notes: on what was left out, for the report
     """
 
     mesh: TetMesh
     source: str
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -57,36 +61,50 @@ class PatientTets:
         return surface_cell(self.mesh, triangles[facing])
 
 
-def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[LabelName]) -> PatientTets:
-    """Tets of a file, with names for their regions.
+def read_tets(
+    file: Path, length_unit: LengthUnit | None, labels: Sequence[LabelName], cell_data: str | None = None
+) -> PatientTets:
+    """Tets of a file, with names for their regions; tag 0 is outside where others have names and it has none.
 
     Args:
         file: vtu, vtk, msh or mesh.
         length_unit: may be left out for files that state it.
         labels: names of the tags, the organ's first. Without them the file's names are taken, the largest region being
             the organ; a single region is named after the file.
+        cell_data: name of the array with the tags, as in `read_mesh`.
 
     Raises:
         MeshError: a file that is no organ, tags without names, names without tets.
     """
     from msdm_core.mesh_files import read_mesh
 
-    mesh = read_mesh(file, length_unit=length_unit)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        mesh = read_mesh(file, length_unit=length_unit, cell_data=cell_data)
+    notes = [str(entry.message) for entry in caught]
     present = np.unique(mesh.region).tolist()
-    named = dict(mesh.region_names) if not labels else {label.value: label.name for label in labels}
+    named: dict[int | str, str] = (
+        dict(mesh.region_names) if not labels else {label.value: label.name for label in labels}
+    )
     if len(present) == 1 and not labels:
         named = {present[0]: named.get(present[0], region_name(file))}
     nameless = [tag for tag in present if tag not in named]
-    if nameless:
-        raise MeshError(
-            f"{file}: regions {', '.join(map(str, nameless))} of {', '.join(map(str, present))} have no name: "
-            "give --labels NAME=TAG,... with the organ first, such as liver=1,lesion=2"
+    if nameless == [0] and len(present) > 1:
+        outside = float(mesh.volumes[mesh.region == 0].sum())
+        notes.append(f"{file.name}: tets of tag 0 have no name and are left out as outside, {outside * 1e6:.4g} ml")
+        present, nameless = [tag for tag in present if tag], []
+    known = ", ".join(map(str, present))
+    if nameless and len(present) > 1:
+        fault = (
+            f"{file}: regions {', '.join(map(str, nameless))} of {known} have no name: give --labels NAME=TAG,... with "
+            "the organ first, such as liver=1,lesion=2; tag 0 needs none, it is outside; take other tets that are no "
+            "tissue out of the file (ParaView: Threshold)"
         )
+        raise MeshError("; ".join([fault, *notes]))
     absent = [f"{name}={tag}" for tag, name in named.items() if tag not in present]
     if absent and labels:
-        raise MeshError(
-            f"{file}: --labels {','.join(absent)}: no tet has this tag; those there are {', '.join(map(str, present))}"
-        )
+        fault = f"{file}: --labels {','.join(absent)}: no tet has this tag; those there are {known}"
+        raise MeshError("; ".join([fault, *notes]))
     order = [tag for tag in named if tag in present]
     if not labels:
         order.sort(key=lambda tag: -float(mesh.volumes[mesh.region == tag].sum()))
@@ -94,7 +112,11 @@ def read_tets(file: Path, length_unit: LengthUnit | None, labels: Sequence[Label
     for number, tag in enumerate(order, start=1):
         tags[mesh.region == tag] = number
     names = tuple((number, named[tag]) for number, tag in enumerate(order, start=1))
-    return PatientTets(in_sweep_order(TetMesh(mesh.points, mesh.tets, tags, names)), file.name)
+    try:
+        kept = TetMesh(*used_nodes(mesh.points, mesh.tets[tags > 0]), tags[tags > 0], names)
+    except MeshError as error:
+        raise MeshError(f"{file}, without the tets of tag 0: {error}") from None
+    return PatientTets(in_sweep_order(kept), file.name, tuple(notes))
 
 
 def patient_of_tets(tets: PatientTets, cell_size: float) -> PatientMesh:
@@ -110,7 +132,7 @@ def patient_of_tets(tets: PatientTets, cell_size: float) -> PatientMesh:
         mesher="the file's tets",
         convention=FILE_CONVENTION,
         sources=(tets.source,),
-        notes=(),
+        notes=tets.notes,
         is_scan=False,
     )
 
@@ -129,7 +151,7 @@ def surfaces_of_tets(tets: PatientTets) -> PatientSurfaces:
         for number, body in enumerate(bodies, start=1):
             numbered = name if len(bodies) == 1 else f"{name} {number}"
             inner.append(ClosedSurface(numbered, *_closed(*body, f"{tets.source}: {numbered}")))
-    return PatientSurfaces(organ, tuple(inner), (tets.source,), ())
+    return PatientSurfaces(organ, tuple(inner), (tets.source,), tets.notes)
 
 
 def _closed(points: FloatArray, triangles: IntArray | Triangles, name: str) -> tuple[FloatArray, Triangles]:

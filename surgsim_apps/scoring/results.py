@@ -8,6 +8,7 @@ from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from msdm_core.mesh_files import checked_content
 from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_env.scene import STILL, agents_folder
 
@@ -97,6 +98,7 @@ def load_result(path: Path) -> Result:
     Raises:
         ValueError: another content (names the file and the fault).
     """
+    checked_content(path)
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
         table["figures"] = {

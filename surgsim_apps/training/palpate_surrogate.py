@@ -183,6 +183,7 @@ class PalpateSurrogate(VectorEnv):
         def ending(index: int) -> dict[str, Any]:
             return {
                 "success": bool(right[index]),
+                "is_success": bool(right[index]),
                 "declared": bool(declared[index]),
                 "hard_limit": bool(hard[index]),
                 "error_mm": float(error[index]) * 1000.0 if declared[index] else -1.0,

@@ -17,6 +17,7 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 
+from msdm_core.mesh_files import checked_content
 from surgsim_apps.training.acquisition import Acquisition
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
 from surgsim_env.envs import TASKS
@@ -192,7 +193,7 @@ def load_policy(path: Path) -> TrainedPolicy:
     description = read_description(path)
     if description.network is None:
         return TrainedPolicy(Acquisition(description.acquisition or ()), description)
-    file = path.with_suffix(".safetensors")
+    file = checked_content(path.with_suffix(".safetensors"))
     try:
         return TrainedPolicy(_filled(description.network, safetensors.torch.load(file.read_bytes())), description)
     except (OSError, safetensors.SafetensorError, KeyError, IndexError, RuntimeError) as error:
@@ -205,7 +206,7 @@ def read_description(path: Path) -> PolicyDescription:
     Raises:
         ValueError: no such file, no JSON, or an unknown, missing or wrong entry.
     """
-    document = path.with_suffix(".json")
+    document = checked_content(path.with_suffix(".json"))
     try:
         table = json.loads(document.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
 from msdm_core.mesh import FloatArray
+from msdm_core.mesh_files import checked_content
 from surgsim_apps.training.site_surrogate import SurrogateFace
 from surgsim_env.coupling import ForceReading
 from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, ORGAN_MAP_SPREAD, LesionEstimator, TouchMap, interpolated
@@ -106,7 +107,7 @@ def _on_surface(surface: FloatArray, extent: FloatArray, points: FloatArray) -> 
 
 def load_faces(path: str | Path) -> RecordedFaces:
     """Read a recording of `agents.record_faces`."""
-    with np.load(path, allow_pickle=False) as file:
+    with np.load(checked_content(Path(path)), allow_pickle=False) as file:
         arrays = {field.name: file[field.name] for field in fields(RecordedFaces)}
     return RecordedFaces(
         **{name: value.astype(np.float64) if value.dtype == np.float32 else value for name, value in arrays.items()}

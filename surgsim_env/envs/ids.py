@@ -1,9 +1,12 @@
 """The environments' ids: the shipped classes, and environments of a user's own tasks."""
 
+from enum import Enum
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from surgsim_env.envs.palpate_sites_env import PalpateSitesEnv
 from surgsim_env.envs.surgical_env import SurgicalEnv
@@ -38,6 +41,24 @@ class BimanualRetractEnv(SurgicalEnv):
     task: BimanualRetractTask
 
 
+class Arguments(dict[str, Any]):
+    """Arguments of a spec: those of `gym.make` and `gym.make_vec` enter in the form that `EnvSpec.to_json` takes."""
+
+    def update(self, *others: Any, **arguments: Any) -> None:
+        """As of any dictionary, with paths as text, members of enumerations as values, numpy's numbers as Python's."""
+        super().update({name: _plain(value) for name, value in dict(*others, **arguments).items()})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, type | np.dtype):
+        return np.dtype(value).name
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def register_task(id: str, task_class: type[Task], *, lanes: bool = True) -> None:
     """Make a task a Gymnasium environment: `gym.make(id)`, and `gym.make_vec(id, ...)` for many side by side.
 
@@ -56,6 +77,7 @@ def register_task(id: str, task_class: type[Task], *, lanes: bool = True) -> Non
         entry_point=f"surgsim_env.envs.ids:{id}",
         vector_entry_point=f"surgsim_env.envs.vector_env:{id}" if lanes else None,
         max_episode_steps=task_class.setup.episode_steps,
+        kwargs=Arguments(),
     )
 
 

@@ -40,8 +40,19 @@ class VectorEnvForStableBaselines(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Start an episode everywhere, with the seeds from `seed`."""
-        observation, self.reset_infos = self.envs.reset(seed=list(self._seeds))  # type: ignore[arg-type]
+        """Start an episode everywhere, with the seeds from `seed` and the options from `set_options`.
+
+        Raises:
+            ValueError: options that differ between environments, or what the environments refuse.
+        """
+        options = self._options[0]
+        for index, other in enumerate(self._options):
+            if other != options:
+                raise ValueError(
+                    f"set_options has {other} for environment {index} and {options} for environment 0; they are reset "
+                    "together: give one dictionary for all"
+                )
+        observation, self.reset_infos = self.envs.reset(seed=list(self._seeds), options=options)  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -56,11 +67,8 @@ class VectorEnvForStableBaselines(VecEnv):
         done = terminated | truncated
         for index in np.flatnonzero(done):
             last = infos[index]
-            final = last.pop("final_info")
             infos[index] = {
-                **final,
-                # stable-baselines3's logger and its evaluation report this entry as a success rate.
-                **({"is_success": bool(final["success"])} if "success" in final else {}),
+                **last.pop("final_info"),
                 "terminal_observation": last.pop("final_obs"),
                 "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
             }

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -70,8 +71,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def __init__(
         self,
-        scene: str | None = None,
-        instrument: str | None = None,
+        scene: str | Path | None = None,
+        instrument: str | Path | None = None,
         *,
         obs_mode: str = "state",
         scaled: bool = True,
@@ -83,7 +84,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         require_known("obs_mode", obs_mode, OBSERVATION_MODES)
         kind = self.task_class
         own = {name: settings.pop(name) for name in setting_names(kind) & set(settings)}
-        simulation, self.runtime = make_runtime(kind, scene, instrument, **own)
+        simulation, self.runtime = make_runtime(kind, scene and str(scene), instrument and str(instrument), **own)
         self.scene, self._mesh = simulation.anatomy.scene, simulation.anatomy.mesh
         self.simulation = simulation
         self._view = EpisodeView(self.simulation, render_mode, settings)

@@ -162,7 +162,7 @@ class LaneVectorEnv(VectorEnv):
         """One control step of all environments whose episode runs; the others are reset as their mode says.
 
         An exception, Ctrl-C among them, breaks off the episodes of the lanes that have moved and not been judged: the
-        next step names one until they are reset, loaded or paused. The other lanes go on where they are.
+        next step names them until they are reset, loaded or paused. The other lanes go on where they are.
 
         Raises:
             RuntimeError: a forked child calls it, where the threads that advance the organs do not run.

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh_files.mesh_file import checked_content
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation.site_press import SitePress, in_threads, press_in_lanes, press_phases
@@ -366,7 +367,7 @@ def _shipped(path: Path, digest: str) -> FloatArray | None:
     """Map beside a scene file; None if it is missing, or of another organ or version."""
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as archive:
+    with np.load(checked_content(path), allow_pickle=False) as archive:
         return archive["grid"] if str(archive["digest"]) == digest else None
 
 

@@ -1,7 +1,6 @@
 """Rendering of an environment by its render_mode: pictures or a live window."""
 
 import ctypes.util
-import os
 import sys
 import time
 from dataclasses import dataclass
@@ -196,9 +195,12 @@ class EpisodeView:
 
 def offered_modes() -> list[str]:
     """Render modes of this machine, as far as is known without loading OpenGL."""
-    switched_on = os.environ.get(gl.VARIABLE, "").lower().strip() not in gl.SWITCHED_OFF
+    try:
+        gl.chosen_kind()
+    except gl.NoGLError:
+        return []
     available = {"human": gl.has_display(), "rgb_array": _has_library()}
-    return [mode for mode in RENDER_MODES if switched_on and available[mode]]
+    return [mode for mode in RENDER_MODES if available[mode]]
 
 
 @cache

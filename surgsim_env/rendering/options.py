@@ -11,6 +11,10 @@ CAMERAS = ("overview", "endoscope", "side", "above")
 PIXELS_MOST = 4096
 
 
+class UnknownArgumentError(ValueError, TypeError):
+    """An argument that an environment does not have; also a TypeError, as of any call: TorchRL tries arguments so."""
+
+
 @dataclass(frozen=True)
 class RenderOptions:
     """Options of pictures, for `gym.make(..., render_mode=...)`; all have defaults.
@@ -54,11 +58,14 @@ def render_options(arguments: dict[str, Any]) -> RenderOptions:
     """Options of pictures from keyword arguments.
 
     Raises:
-        ValueError: an unknown argument (suggests the nearest), or a value that breaks its rule.
+        UnknownArgumentError: an unknown argument (suggests the nearest).
+        ValueError: a value that breaks its rule.
     """
     known = [option.name for option in fields(RenderOptions)]
     for name in arguments:
         if name not in known:
             hint = nearest(name, known)
-            raise ValueError(f"argument {name!r} is unknown; for pictures there are {', '.join(known)}{hint}")
+            raise UnknownArgumentError(
+                f"unexpected keyword argument {name!r}; for pictures there are {', '.join(known)}{hint}"
+            )
     return RenderOptions(**arguments)

@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import dacite
 
 from msdm_core.errors import OrganError
+from msdm_core.mesh_files.mesh_file import checked_content
 from surgsim_env.scene.model import CARTESIAN, PAIRS, LibraryMaterial, Scene
 
 Table = TypeVar("Table")
@@ -47,6 +48,7 @@ def _shipped_folder(packed: Path, checkout: Path) -> Path:
 
 def read_toml(path: Path, kind: str) -> dict[str, Any]:
     """Table of a TOML file; a ValueError names an unreadable file, or the line of invalid TOML."""
+    checked_content(path)
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

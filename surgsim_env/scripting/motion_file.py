@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
+from msdm_core.mesh_files.mesh_file import checked_content
 
 # Largest button mask: 31 bits fit any integer type.
 BUTTONS_LARGEST = 2**31 - 1
@@ -47,7 +48,7 @@ def read_motion(path: Path, mark: str = "", *, of_tip: bool = False) -> Motion:
             buttons, or no rows; names the file and the line or row.
         OSError: the file cannot be read.
     """
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+    with checked_content(path).open(newline="", encoding="utf-8", errors="replace") as file:
         reader = csv.DictReader(file)
         try:
             names = reader.fieldnames or []

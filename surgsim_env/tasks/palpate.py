@@ -120,10 +120,10 @@ class PalpateTask(Task):
 
     ## Info
     Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (by the box, or by an
-    arm's joint and speed limits), `hard_limit`, `declared`, `success` (bool), `force_peak` [N], `cost` (force above the
-    soft limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was declared),
-    `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes through none),
-    `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
+    arm's joint and speed limits), `hard_limit`, `declared`, `success`, `is_success` (bool), `force_peak` [N], `cost`
+    (force above the soft limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was
+    declared), `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes
+    through none), `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
     the tissue, and `damaged` (bool): more than a limit is a safety stop.

@@ -94,7 +94,7 @@ class PalpateSitesTask(Task):
     `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. Of the episode so far: `seconds`, `path_length` [m],
     `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm), `found`
     (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none),
-    `lesion_count_estimated`, `success`.
+    `lesion_count_estimated`, `success`, `is_success`.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
     the tissue, and `damaged` (bool): more than a limit is a safety stop.

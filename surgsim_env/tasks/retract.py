@@ -161,12 +161,13 @@ class RetractTask(Task):
 
     ## Info
     Fixed keys and types. Of the step: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`,
-    `hard_limit`, `torn`, `success`, `holds` (bool), `visible` (share), `grip_force`, `pull_force`, `friction_left`
-    (what friction could still hold) and `force_peak` [N], `trocar_error_mm`, `added_mass` [kg], one `reward_<term>`
-    each. Of the episode so far: `grip_force_peak`, `grip_force_mean`, `pull_force_peak`, `pull_force_mean` [N] (means
-    over the steps that held something), `pull_impulse` [N s], `slips` (holds that began to slip, or were lost while the
-    jaw was commanded to close), `path_length` of the tip [m], `strain_held`, `strain_middle`, `strain_free`: largest
-    strain of an edge of the mesh in the lobe's thirds, from the held edge to the free one.
+    `hard_limit`, `torn`, `success`, `is_success`, `holds` (bool), `visible` (share), `grip_force`, `pull_force`,
+    `friction_left` (what friction could still hold) and `force_peak` [N], `trocar_error_mm`, `added_mass` [kg], one
+    `reward_<term>` each. Of the episode so far: `grip_force_peak`, `grip_force_mean`, `pull_force_peak`,
+    `pull_force_mean` [N] (means over the steps that held something), `pull_impulse` [N s], `slips` (holds that began to
+    slip, or were lost while the jaw was commanded to close), `path_length` of the tip [m], `strain_held`,
+    `strain_middle`, `strain_free`: largest strain of an edge of the mesh in the lobe's thirds, from the held edge to
+    the free one.
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
     the tissue, and `damaged` (bool): more than a limit is a safety stop.
 
@@ -406,7 +407,6 @@ class RetractTask(Task):
             "pull_force": 0.0 if grasp is None else grasp.pull_force,
             "friction_left": 0.0 if grasp is None else grasp.friction_left,
             **self.record.info(),
-            "success": end == "success",
         }
 
     def _look(self, simulation: Simulation, *, past_instruments: bool = True) -> float:

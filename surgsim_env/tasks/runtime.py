@@ -55,7 +55,7 @@ class TaskRuntime:
         layout: of its actions and observations
         family: members that episodes draw from; None for a scene of one organ
         sensors: sensor models, by the channel's name
-        failures: names of the ends that are failures
+        successes, failures: names of the ends that are these
     """
 
     def __init__(self, task: Task, family: OrganFamily | None = None) -> None:
@@ -69,6 +69,7 @@ class TaskRuntime:
         # A subclass may leave out terms whose ends its base returns.
         terms = [term for base in type(task).__mro__ for term in vars(base).get("rewards", ())]
         self._ends = {*ENDS, *(term.name for term in terms if term.per in ("success", "failure"))}
+        self.successes = ("success", *(reward.name for reward in task.rewards if reward.per == "success"))
         # Last values of the terms paid per change.
         self._reached: dict[str, float] = {}
 
@@ -183,11 +184,16 @@ class TaskRuntime:
             for reward in task.rewards
         }
         truncated = not end and task.episode_steps is not None and task.step_count >= task.episode_steps
-        return Verdict(bool(end), truncated, rewards, task.info(step, end) | self._tissue_info(load, end))
+        return Verdict(bool(end), truncated, rewards, self._info(step, load, end))
 
     def first_info(self) -> dict[str, InfoValue]:
         """The task's entries of `info` after a reset."""
-        return self.task.info(None, "") | self._tissue_info(None, "")
+        return self._info(None, None, "")
+
+    def _info(self, step: ControlStep | None, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
+        """The task's entries of `info`, the tissue's, and the success by the names that trainers read."""
+        info = {"success": end in self.successes, **self.task.info(step, end), **self._tissue_info(load, end)}
+        return {**info, "is_success": bool(info["success"])}
 
     def _values(self, step: ControlStep) -> dict[str, float]:
         """Values of the terms paid per change."""

@@ -135,13 +135,15 @@ class Task:
         return "hard_force" if step.force_peak > self.limits.hard_force else ""
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
-        """The task's entries of `info` after a control step, or (None, "") after a reset: the same keys and types."""
+        """The task's entries of `info` after a control step, or (None, "") after a reset: the same keys and types.
+
+        `success` and `is_success` follow from the declaration: True in an end named "success" or as a declared one.
+        """
         peak = 0.0 if step is None else step.force_peak
         return {
             "force_peak": peak,
             "cost": 0.0 if step is None else max(self.limits.excess(peak), 0.0),
             "hard_limit": end == "hard_force",
-            "success": end == "success" or any(term.name == end for term in self.rewards if term.per == "success"),
         }
 
     @property

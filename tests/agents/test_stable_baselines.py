@@ -29,6 +29,17 @@ def test_other_ways_of_resetting_are_refused():
         VectorEnvForStableBaselines(vector("NextStep"))
 
 
+def test_options_are_refused_as_by_one_environment():
+    envs = adapted()
+    for options in ({"anything": 1}, [{}, {"anything": 1}, {}]):
+        envs.set_options(options)
+        with pytest.raises(ValueError, match="anything"):
+            envs.reset()
+    envs.set_options()
+    envs.reset()
+    envs.close()
+
+
 def test_seeds_actions_and_ends_go_through():
     """Two press down until the hard limit ends an episode, one stands still."""
     envs, single = adapted(), gym.make("SurgSim/Palpate-v0")

@@ -69,6 +69,11 @@ def check_organ(image, spacing):
     assert lesions[2] > 6.0
 
 
+def border_notes(notes) -> list[str]:
+    """The notes on an organ that ends with its image."""
+    return [note for note in notes if "border" in note]
+
+
 # A wedge as a liver's edge is one: half its width along x, its length up from its edge along z, how thick that is and
 # how it grows [mm], LPS.
 WEDGE_HALF, WEDGE_LENGTH, WEDGE_EDGE, WEDGE_SLOPE = 48.0, 92.0, 5.0, 0.40

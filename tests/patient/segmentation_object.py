@@ -1,5 +1,6 @@
 """A DICOM segmentation object as a workstation writes it, for tests."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -69,3 +70,22 @@ def write_segmentation(path: Path, masks: dict[str, np.ndarray], spacing, origin
     data.file_meta = meta
     pydicom.dcmwrite(path, data, enforce_file_format=True)
     return path
+
+
+def edited(file: Path, change: Callable[[Dataset], None]) -> Path:
+    """The file, its data set changed."""
+    data = pydicom.dcmread(file)
+    change(data)
+    pydicom.dcmwrite(file, data)
+    return file
+
+
+def as_bytes(data: Dataset, *, kind: str, largest: int, fractional_type: str = "PROBABILITY") -> None:
+    """Change a binary segmentation into one of `kind` with a byte a pixel, `largest` inside."""
+    data.PixelData = (data.pixel_array * np.uint8(largest)).tobytes()
+    data.BitsAllocated = data.BitsStored = 8
+    data.HighBit, data.SegmentationType = 7, kind
+    if kind == "LABELMAP":
+        data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.66.7"
+    else:
+        data.SegmentationFractionalType, data.MaximumFractionalValue = fractional_type, largest

@@ -1,5 +1,6 @@
 """Label images read from files: where voxels lie in the patient, and every way a file can be wrong."""
 
+import gzip
 import struct
 
 import nibabel
@@ -8,8 +9,8 @@ import pytest
 import SimpleITK
 
 from msdm_core.errors import MeshError
-from surgsim_apps.patient.label_image import parse_labels, read_label_image
-from tests.patient.scans import affine_of, check_organ, labels_on, write_nifti
+from surgsim_apps.patient.label_image import clean_labels, parse_labels, read_label_image
+from tests.patient.scans import affine_of, border_notes, check_organ, labels_on, write_nifti
 
 BOTH = parse_labels("liver=1,lesion=2")
 
@@ -86,6 +87,203 @@ def test_nrrd_without_a_space_says_what_is_taken(tmp_path):
     assert "names no anatomical space" in " ".join(image.notes)
 
 
+@pytest.mark.parametrize(
+    ("stored", "scale", "largest"),
+    [
+        (np.uint16, 1.0, 3),
+        (np.int16, 1.0, 3),
+        (np.uint8, 1.0, 7),
+        (np.uint8, 1.0, 200),
+        (np.float32, 1.0 - 2e-7, 3),
+        (np.float32, 1.0 + 3e-4, 3),
+    ],
+)
+def test_labels_stored_with_a_slope_or_rounded_are_the_array_s(stored, scale, largest, tmp_path):
+    """nibabel scales float64 onto the whole range of an integer type: 1 beside 7 becomes 0.988 as a byte."""
+    affine, shape = affine_of()
+    labels = labels_on(affine, shape)
+    image = nibabel.Nifti1Image(np.where(labels == 2, float(largest), labels) * scale, affine)
+    image.set_data_dtype(stored)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    # One label is apart from the others, for the type's range.
+    read = read_label_image(tmp_path / "a.nii.gz", parse_labels(f"liver=1,lesion={largest}"))
+    assert np.bincount(read.tags.ravel())[1:].tolist() == np.bincount(labels.ravel())[1:].tolist()
+    assert any("rounded" in note for note in read.notes)
+
+
+@pytest.mark.parametrize(("stored", "largest"), [(np.uint8, 3), (np.float32, 3), (np.uint8, 300)])
+def test_partial_volumes_and_labels_closer_than_a_slope_are_refused(stored, largest, tmp_path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    labels = labels_on(affine, shape)
+    values = np.where(labels == 2, float(largest), labels)
+    values[0, 0, :2] = 0.113, 0.341
+    image = nibabel.Nifti1Image(values, affine)
+    image.set_data_dtype(stored)
+    nibabel.save(image, tmp_path / "a.nii")
+    refused(tmp_path / "a.nii", "no whole number")
+
+
+def test_negative_labels(tmp_path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    labels = labels_on(affine, shape).astype(np.int8)
+    file = write_nifti(tmp_path / "a.nii", np.where(labels == 2, -1, labels).astype(np.int8), affine)
+    image = read_label_image(file, parse_labels("liver=1,lesion=-1"))
+    assert np.count_nonzero(image.tags == 2) == np.count_nonzero(labels == 2)
+
+
+@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".mha"])
+@pytest.mark.parametrize(
+    ("cut", "cropped", "notes"), [(1.0, True, 0), (0.5, False, 1), (0.5, True, 1), (0.8, False, 1)]
+)
+def test_an_organ_cut_off_is_said_and_one_cropped_to_is_not(suffix, cut, cropped, notes, tmp_path):
+    affine, shape = affine_of()
+    labels = labels_on(affine, shape)[..., : int(cut * shape[2])]
+    if cropped:
+        labels = labels[tuple(slice(used.min(), used.max() + 1) for used in np.nonzero(labels))]
+    image = SimpleITK.GetImageFromArray(np.ascontiguousarray(labels.T))
+    image.SetSpacing((2.0, 2.0, 2.0))
+    SimpleITK.WriteImage(image, str(tmp_path / f"a{suffix}"))
+    read = read_label_image(tmp_path / f"a{suffix}", BOTH if labels.max() == 2 else parse_labels("liver=1"))
+    found = border_notes(clean_labels(read, cell_size=0.006, mend=False).notes)
+    assert len(found) == notes
+    # The area of the last slice, of pixels of 0.04 cm^2.
+    assert all("head" in note and f"{np.count_nonzero(labels[..., -1]) * 0.04:.3g} cm^2" in note for note in found)
+
+
+def two_forms(path, sform, qform, pixdim=None):
+    affine, shape = affine_of()
+    image = nibabel.Nifti1Image(labels_on(affine, shape), None)
+    image.set_sform(sform, 1)
+    image.set_qform(qform, int(pixdim is None))
+    if pixdim is not None:
+        image.header["pixdim"][1:4] = pixdim
+    image.header.set_xyzt_units("mm")
+    nibabel.save(image, path)
+    return read_label_image(path, BOTH).notes, np.array(shape)
+
+
+def test_two_statements_of_a_nifti_header_are_compared(tmp_path):
+    affine, _ = affine_of((2.0, 2.0, 2.5))
+    assert two_forms(tmp_path / "same.nii", affine, affine)[0] == ()
+    flipped = affine @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    flipped[:3, 3] += 5.0, 6.0, 7.0
+    (note,), shape = two_forms(tmp_path / "flipped.nii", affine, flipped)
+    # Voxel (i, j, k) lies (-4 i + 5, -4 j + 6, 7) mm away: farthest at the last.
+    assert f"{np.hypot(np.hypot(5 - 4 * (shape[0] - 1), 6 - 4 * (shape[1] - 1)), 7):.4g} mm" in note
+    (note,), shape = two_forms(tmp_path / "spacing.nii", affine, affine, (2.0, 2.0, 1.25))
+    assert f"{1.25 * (shape[2] - 1):.4g} mm" in note
+
+
+SEGMENTS = "".join(
+    f"Segment{number}_Name:={name}\nSegment{number}_ID:=Segment_{number + 1}\nSegment{number}_LabelValue:=%d\n"
+    f"Segment{number}_Layer:=%d\n"
+    for number, name in enumerate(["Liver", "Tumour"])
+)
+
+
+def write_nrrd(path, values, layers, kinds, sizes, segments):
+    text = (
+        f"NRRD0004\ntype: uint8\ndimension: {len(values.shape)}\nspace: left-posterior-superior\nsizes: {sizes}\n"
+        f"space directions: {layers} (2,0,0) (0,2,0) (0,0,2)\nkinds: {kinds}\nencoding: raw\n"
+        f"space origin: (0,0,0)\n{segments}\n"
+    )
+    path.write_bytes(text.encode() + values.tobytes(order="F"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("units", "spacing"), [('"cm" "cm" "cm"', 0.02), ('"mm" "mm" "mm"', 0.002), ('"m" "m" "m"', 2.0)]
+)
+def test_space_units_of_an_nrrd_file(units, spacing, tmp_path):
+    file = tmp_path / "a.nrrd"
+    write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", f"space units: {units}\n")
+    if spacing > 1.0:
+        refused(file, "2000 x 2000 x 2000 mm")
+    else:
+        assert read_label_image(file).geometry.spacing == pytest.approx(spacing)
+    write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", 'space units: "mm" "cm" "mm"\n')
+    refused(file, "cm, mm")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "chosen"), [((1, 1), ("Liver", "Tumour")), ((1, 1), ("Segment0", "Segment_2")), ((1, 2), (1, 2))]
+)
+def test_layers_of_3d_slicer_s_segments(numbers, chosen, tmp_path):
+    affine, shape = affine_of()
+    labels = labels_on(affine, shape)
+    layers = np.stack([(labels > 0) * numbers[0], (labels == 2) * numbers[1]]).astype(np.uint8)
+    segments = SEGMENTS % (numbers[0], 0, numbers[1], 1)
+    sizes = " ".join(map(str, layers.shape))
+    file = write_nrrd(tmp_path / "a.seg.nrrd", layers, "none", "list domain domain domain", sizes, segments)
+    image = read_label_image(file, parse_labels("liver={},lesion={}".format(*chosen)))
+    assert np.bincount(image.tags.ravel())[1:].tolist() == np.bincount(labels.ravel())[1:].tolist()
+    if numbers == (1, 1):
+        refused(file, "Liver: layer 0, value 1; Tumour: layer 1, value 1")
+    refused(file, "Liver: layer 0, value 1; Tumour: layer 1", parse_labels("liver=9"))
+    beyond = write_nrrd(
+        tmp_path / "b.nrrd", layers, "none", "list domain domain domain", sizes, SEGMENTS % (1, 0, 1, 2)
+    )
+    refused(beyond, "layer 2")
+
+
+def test_names_of_labels_in_the_file_are_listed_and_taken(tmp_path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    labels = labels_on(affine, shape)
+    sizes = " ".join(map(str, shape))
+    nrrd = write_nrrd(tmp_path / "a.nrrd", labels, "", "domain domain domain", sizes, SEGMENTS % (1, 0, 2, 0))
+    # As TotalSegmentator writes it.
+    entries = "".join(
+        f'<Label Key="{key}" Red="1"><![CDATA[{name}]]></Label>' for key, name in ((1, "Liver"), (2, "Tumour"))
+    )
+    table = (
+        f'<?xml version="1.0" encoding="UTF-8"?> <CaretExtension><LabelTable>{entries}</LabelTable></CaretExtension>'
+    )
+    image = nibabel.Nifti1Image(labels, affine)
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, table.encode()))
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    for file in (nrrd, tmp_path / "a.nii.gz"):
+        refused(file, r"1 \(Liver\), 2 \(Tumour\)", parse_labels("liver=5"))
+        refused(file, r"'liver'.* 1 \(Liver\), 2 \(Tumour\)", parse_labels("liver=liver"))
+        read = read_label_image(file, parse_labels("liver=Liver,lesion=Tumour"))
+        assert np.count_nonzero(read.tags == 2) == np.count_nonzero(labels == 2)
+
+
+@pytest.mark.parametrize("hollow", [True, False])
+@pytest.mark.parametrize("text", [None, "liver=1,liver_tumor=1"])
+def test_a_file_for_each_tissue(hollow, text, tmp_path):
+    """The lesions are their file's, whether the organ's file has them, too, or not."""
+    affine, shape = affine_of()
+    labels = labels_on(affine, shape)
+    organ = write_nifti(
+        tmp_path / "liver.nii.gz", ((labels == 1) | (not hollow) & (labels > 0)).astype(np.uint8), affine
+    )
+    lesion = write_nifti(tmp_path / "liver_tumor.nii.gz", (labels == 2).astype(np.uint8), affine)
+    image = read_label_image(organ, parse_labels(text, file_count=2) if text else None, others=[lesion])
+    assert image.names == ("liver", "liver_tumor")
+    assert np.bincount(image.tags.ravel())[1:].tolist() == np.bincount(labels.ravel())[1:].tolist()
+    check_organ(image, (2.0, 2.0, 2.0))
+    assert len(image.notes) == int(not hollow)
+
+
+def test_files_on_other_grids_and_of_several_labels_are_refused(tmp_path):
+    affine, shape = affine_of((4.0, 4.0, 4.0))
+    labels = labels_on(affine, shape)
+    first = write_nifti(tmp_path / "liver.nii.gz", (labels > 0).astype(np.uint8), affine)
+    moved, coarse = affine.copy(), affine @ np.diag([2.0, 2.0, 2.0, 1.0])
+    moved[1, 3] += 3.0
+    wrong = {
+        "both": (labels, affine, r"labels 1, 2"),
+        "moved": ((labels == 2) * 1, moved, "3 mm apart"),
+        "coarse": ((labels == 2)[::2, ::2, ::2] * 1, coarse, "8 x 8 x 8 mm"),
+    }
+    for name, (values, matrix, words) in wrong.items():
+        file = write_nifti(tmp_path / f"{name}.nii.gz", values.astype(np.uint8), matrix)
+        with pytest.raises(MeshError, match=words):
+            read_label_image(first, others=[file])
+    with pytest.raises(MeshError, match=r"1 labels .* 2 files"):
+        parse_labels("liver=1", file_count=2)
+
+
 # ---- files that are wrong ---------------------------------------------------------------------------------------
 
 
@@ -140,6 +338,12 @@ def test_rubbish_is_one_error(suffix, data, tmp_path):
     refused(tmp_path / f"a{suffix}", "empty|cannot be parsed")
 
 
+def test_a_compressed_file_under_the_name_of_a_plain_one(tmp_path):
+    file = plain(tmp_path / "a.nii")
+    file.write_bytes(gzip.compress(file.read_bytes()))
+    refused(file, r"a\.nii\.gz")
+
+
 def test_no_file_and_a_folder(tmp_path):
     refused(tmp_path / "none.nii", "no such file")
     (tmp_path / "folder.nii").mkdir()
@@ -176,8 +380,7 @@ def test_both_versions_and_byte_orders_of_nifti(tmp_path):
     [
         ("liver", "'liver' is no NAME=LABEL"),
         ("liver=1,", "'' is no NAME=LABEL"),
-        ("liver=one", "no NAME=LABEL"),
-        ("liver=-1", "no NAME=LABEL"),
+        ("liver=", "no NAME=LABEL"),
         ("liver=0", "0 is outside"),
         ("liver=1,liver=2", "'liver' is given twice"),
         ("liver=1,lesion=1", "1 is given twice"),

@@ -1,5 +1,8 @@
 """A file of tets becomes a patient: with its own tets, or its surfaces filled anew."""
 
+from pathlib import Path
+
+import meshio
 import numpy as np
 import pytest
 
@@ -68,3 +71,40 @@ def test_a_scene_is_made_of_tets(tmp_path):
     anatomy = load_anatomy(scene)
     assert np.array_equal(np.sort(anatomy.mesh.volumes), np.sort(read_mesh(out).volumes))
     assert len(anatomy.demonstration_lesions()) == 1
+
+
+def padded(tags: np.ndarray, name: str, file: Path) -> Path:
+    """The block [mm] with its tags as cell data of a name."""
+    mesh = block()
+    meshio.Mesh(mesh.points * 1e3, [("tetra", mesh.tets)], cell_data={name: [tags]}).write(file)
+    return file
+
+
+@pytest.mark.parametrize(("suffix", "name"), [(".vtu", "labels"), (".vtk", "region"), (".mesh", "medit:ref")])
+def test_tets_of_tag_0_are_outside_unless_named(tmp_path, suffix, name):
+    """A block of three layers: of tag 0, of the organ and of its lesion."""
+    mesh = block()
+    height = mesh.points[mesh.tets].mean(axis=1)[:, 2]
+    tags = (height > 0.01).astype(int) + (height > 0.03)
+    file = padded(tags, name, tmp_path / f"a{suffix}")
+    given = read_tets(file, "mm", parse_labels("liver=1,lesion=2"))
+    assert given.volume == pytest.approx(mesh.volumes[tags > 0].sum())
+    outside = f"{mesh.volumes[tags == 0].sum() * 1e6:.4g} ml"
+    assert any(outside in note for note in patient_of_tets(given, 0.01).notes)
+    assert any(outside in note for note in surfaces_of_tets(given).notes)
+    named = read_tets(file, "mm", parse_labels("liver=0,stone=1,lesion=2", zero_is_outside=False))
+    assert named.names == ("liver", "stone", "lesion") and named.volume == pytest.approx(SIDE * SIDE * 0.04)
+    with pytest.raises(MeshError, match="0, 2 of 0, 1, 2"):
+        read_tets(file, "mm", parse_labels("liver=1"))
+
+
+def test_cell_data_are_chosen_on_the_command_line(tmp_path, refusal):
+    mesh = block()
+    file = tmp_path / "a.vtu"
+    tags = {"labels": [mesh.region], "part": [(mesh.region == 7) + 4]}
+    meshio.Mesh(mesh.points * 1e3, [("tetra", mesh.tets)], cell_data=tags).write(file)
+    given = ("organ", file, "--length-unit", "mm", "--labels", "liver=3")
+    assert "labels (3, 7), part (4, 5)" in refusal(*given)
+    assert "4, 5 of 4, 5" in refusal(*given, "--cell-data", "part") and "7 of 3, 7" in refusal(
+        *given, "--cell-data", "labels"
+    )

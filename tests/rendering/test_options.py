@@ -9,7 +9,7 @@ BAD = [
     ({"width": 0}, "width is 0; it must be a whole number of pixels from 1 to 4096"),
     ({"height": 480.0}, "height is 480.0"),
     ({"height": 5000}, "height is 5000"),
-    ({"show_lesions": True}, "argument 'show_lesions' is unknown; .*did you mean 'show_lesion'"),
+    ({"show_lesions": True}, "argument 'show_lesions'; .*did you mean 'show_lesion'"),
 ]
 
 

@@ -61,6 +61,29 @@ envs.reset(seed=0)
     assert "libEGL" in after
 
 
+COMMAND = """
+from surgsim_apps.cli.main import main
+assert main(["materials"]) == 0
+"""
+
+
+def test_what_draws_nothing_runs_whatever_mujoco_gl_says(tmp_path):
+    """MuJoCo loads OpenGL when it is imported; a library that is none stands for one that is missing."""
+    for name in ("libOSMesa.so.8", "libOSMesa.so", "libEGL.so.1", "libEGL.so"):
+        (tmp_path / name).write_text("not a library")
+    for kind in ("osmesa", "egl", "nonsense"):
+        given = {gl.VARIABLE: kind, "LD_LIBRARY_PATH": str(tmp_path)}
+        assert "ecoflex_00_10" in run(COMMAND, **given), kind
+        output = run(DRAW, **given)
+        assert output.startswith("NoGLError") and gl.VARIABLE in output and kind in output.lower(), kind
+
+
+@pytest.mark.parametrize("name", [gl.DEVICE, gl.PLATFORM])
+def test_a_variable_that_is_wrong_is_named_and_no_package(opengl, name):
+    output = run(DRAW, **{name: "77"})
+    assert output.startswith("NoGLError") and f"{name} is '77'" in output and PACKAGES not in output
+
+
 def test_missing_library_names_the_packages(tmp_path):
     """A file that is no library stands before the real one, as good as none."""
     for name in ("libEGL.so.1", "libEGL.so"):

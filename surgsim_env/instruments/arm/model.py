@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from msdm_core.arithmetic import matmul, norm
+from msdm_core.mesh_files.mesh_file import checked_content
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.urdf import prepare_urdf
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
@@ -109,6 +110,7 @@ def read_xml(path: Path) -> ElementTree.Element:
     Raises:
         ValueError: an unreadable file, one larger than FILE_SIZE_MOST, or one without valid XML.
     """
+    checked_content(path)
     try:
         size = path.stat().st_size
         if size > FILE_SIZE_MOST:

@@ -62,7 +62,6 @@ def test_the_limits_of_size_are_allowed(tmp_path):
 FAR = np.vstack([POINTS[:4], POINTS[:4] + 300])
 BAD_BODIES = {
     "nan": (np.where(POINTS == 100, np.nan, POINTS), [("tetra", TETS)], "node 1 is at"),
-    "unused": (POINTS, [("tetra", TETS[:1])], r"node 4 \(of 1\) belongs to no tet; .*drop unused nodes"),
     "duplicate": (np.vstack([POINTS[:4], POINTS[:1]]), [("tetra", TETS)], "nodes 0 and 4 are duplicates"),
     "flat": (np.vstack([POINTS[:4] * [1, 1, 1e-9], POINTS[4:]]), [("tetra", TETS)], r"tet 0 \(of 1\) is degenerate"),
     "apart": (FAR, [("tetra", [[0, 1, 2, 3], [4, 5, 6, 7]])], "falls into 2 disconnected parts"),
@@ -152,3 +151,36 @@ def test_a_vertex_short_of_coordinates_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 0.01\nv 0 0.01 0\nv 0 0 0.01\nf 1 2 3\nf 1 3 4\n")
     with pytest.raises(MeshError, match="a vertex has 1 coordinates"):
         read_surface(tmp_path / "a.obj", length_unit="m")
+
+
+def test_tets_in_two_groups_of_gmsh_22_are_named(tmp_path):
+    tags = {key: [np.array([3, 1, 5])] for key in ("gmsh:physical", "gmsh:geometrical")}
+    cells = [("tetra", TETS[[0, 1, 1]])]
+    path = written(tmp_path / "a.msh", cells=cells, cell_data=tags, file_format="gmsh22")
+    with pytest.raises(MeshError, match=r"1 tets .*\b1, 5\b"):
+        read_mesh(path, length_unit="mm")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "named"),
+    [({"a": [0, 1], "b": [2, 1]}, r"a \(0, 1\), b \(1, 2\)"), ({"region": [0.5, 1.0]}, "region of tet 0 is 0.5")],
+)
+def test_tags_in_doubt_are_refused(tmp_path, arrays, named):
+    path = written(tmp_path / "a.vtu", cell_data={name: [np.array(values)] for name, values in arrays.items()})
+    with pytest.raises(MeshError, match=named):
+        read_mesh(path, length_unit="mm")
+    with pytest.raises(MeshError, match="'c'"):
+        read_mesh(path, length_unit="mm", cell_data="c")
+
+
+@pytest.mark.parametrize("content", [".vtu", ".vtk", ".msh", ".mesh", ".stl", ".ply", ".obj"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".mesh", ".stl", ".ply", ".obj"])
+def test_a_file_with_the_suffix_of_another_format_is_named(tmp_path, content, suffix):
+    cells = [("tetra", TETS)] if content in (".vtu", ".vtk", ".msh", ".mesh") else [("triangle", TETS[:, :3])]
+    # meshio alone writes ANSYS files as .msh.
+    file_format = "gmsh" if content == ".msh" else None
+    file = written(tmp_path / f"a{content}", cells=cells, file_format=file_format).rename(tmp_path / f"b{suffix}")
+    read = read_mesh if suffix in (".vtu", ".vtk", ".msh", ".mesh") else read_surface
+    if content != suffix:
+        with pytest.raises(MeshError, match=f"is a {content} by its content"):
+            read(file, length_unit="mm")

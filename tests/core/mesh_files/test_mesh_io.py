@@ -129,3 +129,61 @@ def test_units_scale_the_points(tmp_path, unit, metres):
     points = POINTS / 100 / metres * 0.2
     mesh = read_mesh(written(tmp_path / "a.vtu", points=points), length_unit=unit)
     assert np.ptp(mesh.points, axis=0) == pytest.approx([0.2] * 3)
+
+
+# Volume 1 is in the groups 1 and 5, volume 2 in `groups`.
+VOLUMES = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$Entities
+0 0 0 2
+1 0 0 0 1 1 1 2 1 5 0
+2 0 0 0 1 1 1 {groups} 0
+$EndEntities
+$Nodes
+1 5 1 5
+3 1 0 5
+1 2 3 4 5
+0 0 0 30 0 0 0 30 0 0 0 30 30 30 30
+$EndNodes
+$Elements
+2 2 1 2
+3 1 4 1
+1 1 2 3 4
+3 2 4 1
+2 2 3 4 5
+$EndElements
+"""
+
+
+@pytest.mark.parametrize(("groups", "tags"), [("1 2", [1, 2]), ("0", [1, 0])])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_volumes_of_gmsh_in_two_groups_or_in_none(tmp_path, groups, tags, newline):
+    (tmp_path / "a.msh").write_text(VOLUMES.format(groups=groups), newline=newline)
+    with pytest.warns(UserWarning, match=r"\b1, 5\b"):
+        mesh = read_mesh(tmp_path / "a.msh", length_unit="mm")
+    assert mesh.region.tolist() == tags and mesh.volumes.sum() == pytest.approx(13.5e-6)
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".mesh"])
+def test_unused_nodes_are_left_out(tmp_path, suffix):
+    points = np.vstack([[7.0, 7, 7], POINTS, POINTS[:1]])
+    with pytest.warns(UserWarning, match="2 nodes"):
+        mesh = read_mesh(written(tmp_path / f"a{suffix}", points, [("tetra", TETS + 1)]), length_unit="mm")
+    np.testing.assert_array_equal(mesh.points, POINTS * 0.001)
+    np.testing.assert_array_equal(np.sort(mesh.tets, axis=1), TETS)
+
+
+@pytest.mark.parametrize("numbers", [[3, 4], [3.0, 4.0], [[3], [4]]])
+def test_cell_data_of_any_name(tmp_path, numbers):
+    arrays = {"labels": [np.array(numbers)], "quality": [np.array([0.5, 0.7])], "part": [np.array([1, 1])]}
+    path = written(tmp_path / "a.vtu", cell_data=arrays)
+    with pytest.warns(UserWarning, match=r"labels \(3, 4\)"):
+        assert read_mesh(path, length_unit="mm").region.tolist() == [3, 4]
+    assert read_mesh(path, length_unit="mm", cell_data="part").region.tolist() == [1, 1]
+
+
+def test_point_data_are_named(tmp_path):
+    path = written(tmp_path / "a.vtu", point_data={"labels": np.array([0, 1, 1, 2, 0])})
+    with pytest.warns(UserWarning, match=r"labels \(0, 1, 2\)"):
+        assert read_mesh(path, length_unit="mm").region.tolist() == [0, 0]

@@ -82,10 +82,34 @@ def test_a_surface_that_is_none_is_refused(tmp_path, points, faces, message, suf
         read_surface(path, length_unit="mm")
 
 
-def test_a_binary_stl_cut_short_is_refused(tmp_path):
+@pytest.mark.parametrize("header", [b"", b"solid liver"])
+def test_a_binary_stl_of_another_length_than_its_header_states(tmp_path, header):
+    whole = trimesh.Trimesh(CORNERS, FACES).export(file_type="stl")
+    whole = header.ljust(80) + whole[80:]
     path = tmp_path / "a.stl"
-    trimesh.Trimesh(CORNERS, FACES).export(path)
-    assert len(path.read_bytes()) == 84 + 4 * 50, "this test needs a binary STL"
-    path.write_bytes(path.read_bytes()[:-60])
-    with pytest.raises(MeshError, match=r"a\.stl: "):
+    for cut, there in ((20, 3), (60, 2), (200, 0)):
+        path.write_bytes(whole[:-cut])
+        with pytest.raises(MeshError, match=rf"\b4 triangles .*\b{there} are there"):
+            read_surface(path, length_unit="mm")
+    for extra in (1, 16, 1000):
+        path.write_bytes(whole + bytes(extra))
+        with pytest.warns(UserWarning, match=f"{extra} bytes"):
+            _, triangles = read_surface(path, length_unit="mm")
+        assert len(triangles) == 4
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply"])
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_text_cut_short_is_refused(tmp_path, suffix, share):
+    path = surface_file(tmp_path / f"a{suffix}")
+    text = path.read_text()
+    path.write_text(text[: int(share * len(text))])
+    with pytest.raises(MeshError, match="cut short"):
         read_surface(path, length_unit="mm")
+
+
+def test_a_second_solid_cut_short_is_refused(tmp_path):
+    text = surface_file(tmp_path / "a.stl").read_text()
+    (tmp_path / "a.stl").write_text(text + text[:-60])
+    with pytest.raises(MeshError, match=r"2 solids .* 1 are there"):
+        read_surface(tmp_path / "a.stl", length_unit="mm")

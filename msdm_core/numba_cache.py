@@ -24,9 +24,11 @@ import platformdirs
 from numba.core import config, dispatcher, event
 from numba.core.caching import FunctionCache
 
-__all__ = ["FOLDER_PREFIX", "kernel_cache"]
+__all__ = ["FOLDER_PREFIX", "NUMBA_CONFIG", "kernel_cache"]
 
 LOGGER = logging.getLogger("msdm_core")
+# Untyped: its names are made when it is imported.
+NUMBA_CONFIG: Any = config
 KERNEL_FILES = "*kernels.py"
 FOLDER_PREFIX = "surgsim-kernels-"
 UNUSED_AGE = 7 * 24 * 3600.0  # [s]
@@ -45,15 +47,16 @@ def kernel_cache(*source_folders: Path) -> Iterator[None]:
     files = sorted(file for folder in source_folders for file in folder.rglob(KERNEL_FILES))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
     with SETTINGS_LOCK:
-        settings: Any = config
         decorators: Any = dispatcher
-        place, cache = settings.CACHE_DIR, decorators.FunctionCache
-        settings.CACHE_DIR = str(_cache_folder(place, f"{FOLDER_PREFIX}{digest}"))
+        place, cache, disabled = NUMBA_CONFIG.CACHE_DIR, decorators.FunctionCache, NUMBA_CONFIG.DISABLE_JIT
+        NUMBA_CONFIG.CACHE_DIR = str(_cache_folder(place, f"{FOLDER_PREFIX}{digest}"))
         decorators.FunctionCache = KernelCache
+        # Vector code has no form in Python: NUMBA_DISABLE_JIT is for other functions, and for the loop of haptic steps.
+        NUMBA_CONFIG.DISABLE_JIT = 0
         try:
             yield
         finally:
-            settings.CACHE_DIR, decorators.FunctionCache = place, cache
+            NUMBA_CONFIG.CACHE_DIR, decorators.FunctionCache, NUMBA_CONFIG.DISABLE_JIT = place, cache, disabled
 
 
 def _cache_folder(chosen: str, name: str) -> Path:
@@ -134,13 +137,13 @@ def _warn_of_no_room(folder: Path, reason: str) -> None:
 
 
 class CompileMessage(event.Listener):
-    """Log messages during a compilation of kernels longer than PATIENCE and at its end.
+    """Log messages during a compilation of kernels longer than PATIENCE and at its end; NUMBA_DISABLE_JIT rests in it.
 
     numba calls it under its compiler's lock, before and after each function; compilations of callees are nested.
     """
 
     def __init__(self) -> None:
-        self._depth, self._begin, self._logged = 0, 0.0, False
+        self._depth, self._begin, self._logged, self._disabled = 0, 0.0, False, 0
 
     def on_start(self, event: Any) -> None:
         """Before a function is compiled."""
@@ -148,6 +151,7 @@ class CompileMessage(event.Listener):
             return
         if self._depth == 0:
             self._begin, self._logged = time.monotonic(), False
+            self._disabled, NUMBA_CONFIG.DISABLE_JIT = NUMBA_CONFIG.DISABLE_JIT, 0
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
@@ -159,6 +163,8 @@ class CompileMessage(event.Listener):
         if spent > PATIENCE and not self._logged:
             self._logged = True
             LOGGER.warning("surgsim: compiling for this processor, once: up to a minute ...")
+        if self._depth == 0:
+            NUMBA_CONFIG.DISABLE_JIT = self._disabled
         if self._depth == 0 and self._logged:
             LOGGER.warning("surgsim: compiled in %.0f s", spent)
 

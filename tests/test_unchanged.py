@@ -24,6 +24,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -39,6 +40,7 @@ from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import MemberName
 from surgsim_env.scene.family import make_member
 from surgsim_env.scripting import ScriptError, Trace, oracle_script, run_script
+from surgsim_env.tasks.runtime import _kept_value
 
 ROOT = Path(__file__).resolve().parents[1]
 HASHES = Path(__file__).with_name("unchanged_hashes.json")
@@ -96,13 +98,27 @@ def parsed(value: object) -> object:
     return [parsed(entry) for entry in value] if isinstance(value, list) else value
 
 
+def tabled(value: Any) -> Any:
+    """A kept value as plain JSON: arrays as lists with their types."""
+    if isinstance(value, np.ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
+    if isinstance(value, Mapping):
+        return {key: tabled(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [tabled(entry) for entry in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def saved(env: gym.Env) -> dict[str, object]:
     """The contents of an environment's saved state but for the mark of what made it, which names classes."""
     with np.load(io.BytesIO(env.unwrapped.save_state()), allow_pickle=False) as archive:  # type: ignore[attr-defined]
         arrays: dict[str, object] = {name: archive[name] for name in archive.files if name != "made_by"}
+    task = json.loads(str(arrays["task"]))
+    for part in ("sensed", "kept"):
+        task[part] = {name: tabled(_kept_value(form)) for name, form in task[part].items()}
     return {
         **arrays,
-        "task": parsed(str(arrays["task"])),
+        "task": parsed(json.dumps(task)),
         "random": parsed(str(arrays["random"])),
     }
 

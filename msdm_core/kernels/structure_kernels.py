@@ -224,9 +224,20 @@ class OrganModel(NamedTuple):
     stable_step: float
     added_mass: float
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled arrays come back writable."""
+        return _read_only_model, tuple(self)
+
     def __deepcopy__(self, memo: dict) -> "OrganModel":
         """The model itself: it is read-only, and numba would compile everything again for writable copies."""
         return self
+
+
+def _read_only_model(*fields: Any) -> OrganModel:
+    for field in fields:
+        if isinstance(field, np.ndarray):
+            field.setflags(write=False)
+    return OrganModel(*fields)
 
 
 class OrganState(NamedTuple):

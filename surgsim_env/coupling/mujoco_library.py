@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 from llvmlite import binding
 
+from msdm_core.numba_cache import NUMBA_CONFIG
 from surgsim_env.coupling import mujoco_library
 from surgsim_env.instruments.mujoco_kernels import MUJOCO_FUNCTIONS
 
@@ -46,7 +47,8 @@ def missing() -> str:
     return _missing
 
 
-# "python": haptic steps run in Python, as they do without this variable if MuJoCo's functions cannot be linked.
+# "python": haptic steps run in Python, as they do without this variable if MuJoCo's functions cannot be linked, or with
+# NUMBA_DISABLE_JIT, numba's own switch.
 LOOP_VARIABLE = "SURGSIM_LOOP"
 
 
@@ -56,7 +58,7 @@ def runs_compiled() -> bool:
     Raises:
         ValueError: the variable is neither "compiled" nor "python".
     """
-    loop = os.environ.get(LOOP_VARIABLE, "compiled")
+    loop = os.environ.get(LOOP_VARIABLE, "python" if NUMBA_CONFIG.DISABLE_JIT else "compiled")
     if loop not in ("compiled", "python"):
         raise ValueError(f'{LOOP_VARIABLE} is {loop!r}; it is "compiled" or "python"')
     return loop == "compiled" and not _warn_of_missing_library(mujoco_library.missing())

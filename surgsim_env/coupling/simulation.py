@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.arithmetic import matmul
+from msdm_core.arithmetic import matmul, solve
 from msdm_core.errors import OrganError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, KEPT_NAMES, OrganModel, OrganState
@@ -182,6 +182,13 @@ class Simulation:
         weights = engaged * model.surface_rest_area[:, None]
         points = matmul(QUADRATURE_BARYCENTRIC, corners)
         return (weights[:, :, None] * points).sum(axis=(0, 1)) / weights.sum()
+
+    def covers(self, point: FloatArray) -> bool:
+        """True for a point [m] (3,) inside the organ or on its surface: its coordinates in a tet are not negative."""
+        corners = self.organ_state.node_position[self.organ_model.tet_nodes]
+        edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+        shares = solve(edges, (point - corners[:, 0])[:, :, None])[:, :, 0]
+        return bool(((shares.min(axis=1) >= 0.0) & (shares.sum(axis=1) <= 1.0)).any())
 
     def take_anatomy(self, anatomy: Anatomy) -> None:
         """Go on with another member of the scene's family; its organ comes with the next `reset`."""

@@ -96,7 +96,17 @@ def environment_class(task_class: type[Task]) -> type[SurgicalEnv]:
         if shipped.task_class is task_class:
             return shipped
     name = task_class.__name__.removesuffix("Task") + "Env"
-    return type(name, (SurgicalEnv,), {"task_class": task_class, "__module__": task_class.__module__})
+    own = {"task_class": task_class, "__module__": task_class.__module__, "__reduce__": _pickled}
+    return type(name, (SurgicalEnv,), own)
+
+
+def _pickled(env: SurgicalEnv) -> tuple[Any, ...]:
+    """An environment of a class that no module has under its name, by its task's class."""
+    return _blank, (type(env).task_class,), vars(env)
+
+
+def _blank(task_class: type[Task]) -> SurgicalEnv:
+    return object.__new__(environment_class(task_class))
 
 
 def register() -> None:

@@ -12,7 +12,7 @@ from surgsim_env.scene.model import Scene
 from surgsim_env.tasks.runtime import TaskRuntime
 
 # Version of the format.
-STATE_VERSION = 1
+STATE_VERSION = 2
 
 
 def state_maker(kind: str, scene: Scene, mesh: TetMesh) -> str:
@@ -60,9 +60,10 @@ def restore_state(
     check_entries(given, like)
     text = str(given["task"])
     anatomy = runtime.task.anatomy if runtime.family is None else runtime.family.named(str(given["member"]))
+    saved = runtime.read_state(text, anatomy)
     # The first change, which leaves all as it is if it is refused.
-    simulation.set_state(runtime.saved_organ(text, anatomy), arrays)
-    runtime.set_state(text, anatomy)
+    simulation.set_state(saved["drawn"].compiled(anatomy), arrays)
+    runtime.set_state(saved, anatomy)
     simulation.take_anatomy(anatomy)
     return given
 

@@ -31,6 +31,10 @@ Info = dict[str, Any]
 
 # How far an action may leave [-1, 1] by rounding.
 ACTION_SLACK = 1e-6
+# Why no step may be taken: states of an environment without a running episode.
+NOT_BEGUN = "no episode has begun, or its reset failed"
+OVER = "the episode is over"
+BROKEN_OFF = "an exception broke off the last step, so that its organ and its counts may not be of one moment"
 # Kinds of observation, and the size of an observed picture [pixels].
 OBSERVATION_MODES = ("state", "rgb", "rgb_force")
 PICTURE_SIZE = 84
@@ -125,8 +129,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self.take_looks(looks)
         # The action of the last step, after wrappers changed it.
         self.last_action = np.zeros(self.layout.action_size)
-        self._begun = False
-        self._running = False
+        # Why no step may be taken; "" while an episode runs.
+        self.halted = NOT_BEGUN
 
     def take_looks(self, looks: str) -> None:
         """Draw a look of a split for the pictures of each episode from the next reset on.
@@ -142,7 +146,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
                 'render_mode="rgb_array"'
             )
         self._look_ranges = find_look_ranges(looks)
-        self._begun = self._running = False
+        self.halted = NOT_BEGUN
 
     @property
     def look(self) -> Look | None:
@@ -151,9 +155,10 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
         """Draw an episode and put its organ and instrument at rest; no options are known."""
-        super().reset(seed=seed)
         if options:
             raise ValueError(f"reset option {next(iter(options))!r} is unknown; this environment takes none")
+        self.halted = NOT_BEGUN
+        super().reset(seed=seed)
         self._draw_look(seed)
         self._draw()
         values, saturated = self.runtime.observe(ControlStep(self.simulation), self.np_random)
@@ -163,16 +168,18 @@ class SurgicalEnv(gym.Env[Observation, Action]):
                 "high: widen them, or correct read"
             )
         self._take(values)
-        self._begun = self._running = True
         info = self._info("", saturated, self.runtime.first_info(), dict.fromkeys(reward_weights(self.task), 0.0))
+        self.halted = ""
         self._show()
         return self._observed(), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
         """One control step: haptic steps until it is over, a force limit is passed or the simulation faults.
 
+        An exception in a step that has begun, Ctrl-C among them, breaks the episode off: `reset` or `load_state`.
+
         Raises:
-            ResetNeeded: no episode is running.
+            ResetNeeded: no episode is running, or the last step was broken off.
             ValueError: names the entry of the action that is out of bounds.
         """
         self.begin(self.checked(action))
@@ -187,8 +194,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             ValueError: names the entry of the action that is out of bounds.
         """
         place, wrapper = ("", "ClipAction") if lane is None else (f"lane {lane}: ", "vector.ClipAction")
-        if not self._running:
-            raise gym.error.ResetNeeded(f"{place}the episode is over or has not begun: call reset()")
+        if self.halted:
+            raise gym.error.ResetNeeded(f"{place}{self.halted}: call reset()")
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape:
             raise ValueError(f"{place}action has shape {values.shape}; the rule is {self.action_space.shape}")
@@ -202,6 +209,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def begin(self, action: FloatArray) -> None:
         """Command a `checked` action (n_action,): the first part of `step`."""
+        self.halted = BROKEN_OFF
         self.last_action = action
         self.runtime.begin(action, self.simulation.instrument)
 
@@ -230,11 +238,11 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             if not fault:
                 self._take(values)
         verdict = self.runtime.judge(ControlStep(self.simulation, self.force_peak, fault))
-        self._running = not (verdict.terminated or verdict.truncated)
         info = self._info(fault, saturated, verdict.info, verdict.rewards)
-        self._show()
         # Not `sum`, which rounds once from Python 3.12 on and at each term before.
         reward = math.fsum(verdict.rewards.values())
+        self.halted = OVER if verdict.terminated or verdict.truncated else ""
+        self._show()
         return self._observed(), reward, verdict.terminated, verdict.truncated, info
 
     @property
@@ -309,10 +317,10 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         Wrappers keep counts of their own (TimeLimit): load a state into an environment that was just reset.
 
         Raises:
-            ResetNeeded: before the first reset there is nothing to save.
+            ResetNeeded: no episode has begun, or the last step was broken off.
         """
-        if not self._begun:
-            raise gym.error.ResetNeeded("nothing to save before the first reset: call reset()")
+        if self.halted in (NOT_BEGUN, BROKEN_OFF):
+            raise gym.error.ResetNeeded(f"nothing to save: {self.halted}: call reset()")
         return pack_state(self._maker(), self.simulation, self.runtime, self._own_state())
 
     def load_state(self, state: bytes) -> None:
@@ -324,20 +332,27 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             ValueError: bytes that are no saved state, or one of another scene, mesh or version (names both); names the
                 entry that is missing, unknown or of another shape.
         """
-        own = restore_state(state, self._maker(), self.simulation, self.runtime, self._own_state())
-        self.np_random.bit_generator.state = json.loads(str(own["random"]))
-        if self._look_ranges is not None:
-            self._look = fill(Look, json.loads(str(own["look"])), "look")
-            self._look_random.bit_generator.state = json.loads(str(own["look_random"]))
-        self._take(own["observation"])
-        self._begun, self._running = True, bool(own["running"])
+        before = self.simulation.organ_state
+        try:
+            own = restore_state(state, self._maker(), self.simulation, self.runtime, self._own_state())
+            self.np_random.bit_generator.state = json.loads(str(own["random"]))
+            if self._look_ranges is not None:
+                self._look = fill(Look, json.loads(str(own["look"])), "look")
+                self._look_random.bit_generator.state = json.loads(str(own["look_random"]))
+            self._take(own["observation"])
+        except BaseException:
+            # A refused state has changed nothing; an interrupt, or a task's own setter, may come later.
+            if self.simulation.organ_state is not before:
+                self.halted = BROKEN_OFF
+            raise
+        self.halted = "" if own["running"] else OVER
 
     def _own_state(self) -> dict[str, np.ndarray]:
         """The environment's part of a saved state, by name."""
         arrays = {
             "random": np.array(json.dumps(self.np_random.bit_generator.state)),
             "observation": self._observation.copy(),
-            "running": np.array(self._running),
+            "running": np.array(not self.halted),
         }
         if self._look_ranges is not None:
             look = None if self._look is None else asdict(self._look)
@@ -394,8 +409,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         return observed
 
     def _shown(self) -> Shown:
-        if not self._begun:
-            raise gym.error.ResetNeeded("nothing to show before the first reset: call reset()")
+        if self.halted == NOT_BEGUN:
+            raise gym.error.ResetNeeded(f"nothing to show: {NOT_BEGUN}: call reset()")
         target, endoscope = self.task.pictured.target, self.task.pictured.endoscope
         moved = None if target is None else target.moved(self.simulation.ground_shift(target.centre))
         return Shown(self.task.lesions, moved, endoscope, self._look, self.task.step_count)

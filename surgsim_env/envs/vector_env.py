@@ -2,6 +2,7 @@
 
 import math
 import os
+import threading
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -17,7 +18,8 @@ from msdm_core.kernels.vector_kernels import lane_counts
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.envs import ids
-from surgsim_env.envs.surgical_env import SurgicalEnv
+from surgsim_env.envs.surgical_env import OVER, SurgicalEnv
+from surgsim_env.scene.load import require_known
 
 
 class LaneVectorEnv(VectorEnv):
@@ -42,8 +44,8 @@ class LaneVectorEnv(VectorEnv):
         envs: the environment of each lane
 
     Raises:
-        ValueError: an unknown autoreset_mode, max_episode_steps below 1, a window for several environments, or what a
-            single environment refuses.
+        ValueError: an unknown autoreset_mode or dtype, a count that is no whole number above 0, a window for several
+            environments, or what a single environment refuses.
     """
 
     # The environment of each lane, which a subclass says.
@@ -60,11 +62,17 @@ class LaneVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
+        threads = core_count() if threads is None else threads
+        steps = 1 if max_episode_steps is None else max_episode_steps
+        for name, count in {"num_envs": num_envs, "threads": threads, "max_episode_steps": steps}.items():
+            if not isinstance(count, int | np.integer) or count < 1:
+                raise ValueError(f"{name} is {count!r}; it must be a whole number, at least 1")
         if render_mode == "human" and num_envs != 1:
             raise ValueError(f'render_mode "human" shows one environment, not {num_envs}: use "rgb_array"')
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps is {max_episode_steps}; it must be at least 1, or None")
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        require_known("autoreset_mode", mode, [known.value for known in AutoresetMode])
+        require_known("dtype", dtype, ("float64", "float32"))
+        self.autoreset_mode = AutoresetMode(mode)
         self.envs = [self.single(render_mode=render_mode, **settings) for _ in range(num_envs)]
         first = self.envs[0]
         self.num_envs, self.render_mode = num_envs, render_mode
@@ -75,19 +83,34 @@ class LaneVectorEnv(VectorEnv):
         own_steps = first.task.episode_steps or math.inf
         # The environment truncates an episode of its own number of steps by itself.
         self._step_limit = math.inf if (max_episode_steps or math.inf) >= own_steps else max_episode_steps
-        threads = threads if threads is not None else core_count()
         width = group_width(num_envs, np.dtype(dtype), threads)
         self._members = [range(first, min(first + width, num_envs)) for first in range(0, num_envs, width)]
         self._groups = [
             LaneGroup([self.envs[lane].simulation for lane in members], np.dtype(dtype).type, width)
             for members in self._members
         ]
-        self._pool = ThreadPoolExecutor(max_workers=min(len(self._groups), threads))
-        # The last observation of each lane, and the lanes whose episode is over.
+        # The last observation of each lane.
         self._observations: list[Any] = [None] * num_envs
-        self._over, self._paused = np.zeros((2, num_envs), dtype=np.bool_)
+        self._paused = np.zeros(num_envs, dtype=np.bool_)
+        self._pool = ThreadPoolExecutor(max_workers=min(len(self._groups), threads))
         # The threads live in this process alone: a forked child has none of them, and would wait for them for ever.
         self._process = os.getpid()
+        # Held while a group advances, which it does only in the round in which it was asked to.
+        self._locks = [threading.Lock() for _ in self._groups]
+        self._round = 0
+
+    def _await_threads(self) -> None:
+        """Wait for groups that still advance after an exception in `step`; those that have not begun will not."""
+        self._round += 1
+        for lock in self._locks:
+            with lock:
+                pass
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise TypeError(
+            f"{type(self).__name__} cannot be pickled or copied, as its threads run in this process alone: pickle its "
+            "`envs`, or make another with gym.make_vec and load their saved states"
+        )
 
     @property
     def observation_slices(self) -> dict[str, slice]:
@@ -111,9 +134,7 @@ class LaneVectorEnv(VectorEnv):
         """
         self._check_process()
         options = dict(options or {})
-        begins = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
-        if begins.shape != (self.num_envs,) or begins.dtype != np.bool_:
-            raise ValueError(f"reset_mask is {begins.dtype} {begins.shape}; the rule is bool ({self.num_envs},)")
+        begins = self._mask(options.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)), "reset_mask")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int):
             seeds = [seeds + lane for lane in range(self.num_envs)]
@@ -122,8 +143,8 @@ class LaneVectorEnv(VectorEnv):
         infos: dict[str, Any] = {}
         for lane in np.flatnonzero(begins).tolist():
             self._observations[lane], info = self.envs[lane].reset(seed=seeds[lane], options=options)
+            self._paused[lane] = False
             enter_info(infos, info, lane, self.num_envs)
-        self._over[begins] = self._paused[begins] = False
         return self._together(), infos
 
     def pause(self, mask: NDArray[np.bool_]) -> None:
@@ -131,28 +152,44 @@ class LaneVectorEnv(VectorEnv):
 
         A step gives of them the last observation, a reward of 0, False for both ends, and no info; their actions are
         not read. So nothing is computed for lanes whose last episode is over.
+
+        Raises:
+            ValueError: a mask of another shape or type.
         """
-        self._paused = np.array(mask)
+        self._paused = self._mask(mask, "mask")
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control step of all environments whose episode runs; the others are reset as their mode says.
 
+        An exception, Ctrl-C among them, breaks off the episodes of the lanes that have moved and not been judged: the
+        next step names them until they are reset, loaded or paused. The other lanes go on where they are.
+
         Raises:
             RuntimeError: a forked child calls it, where the threads that advance the organs do not run.
-            ResetNeeded: an episode is over, and the mode does not reset it (names the lane).
+            ResetNeeded: an episode is over and the mode does not reset it, or was broken off (names the lane).
             ValueError: names the lane and the entry of the action that is out of bounds; no environment has moved.
         """
         self._check_process()
-        resets = self._over & ~self._paused & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
-        moving = self._checked(actions, ~(resets | self._paused))
+        # Why each lane takes no step; "" while its episode runs. No copy of it, which an exception could leave behind.
+        halts = [env.halted or OVER * (env.task.step_count >= self._step_limit) for env in self.envs]
+        next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        resets = np.array([next_step and halt == OVER for halt in halts]) & ~self._paused
+        moving = self._checked(actions, np.flatnonzero(~(resets | self._paused)).tolist(), halts)
         for lane, action in moving.items():
             self.envs[lane].begin(action)
 
-        def advance(lanes: LaneGroup, members: range) -> None:
-            if group := [self.envs[lane] for lane in members if lane in moving]:
-                group[0].advance(group, lanes)
+        started = self._round
 
-        list(self._pool.map(advance, self._groups, self._members))
+        def advance(lanes: LaneGroup, members: range, lock: threading.Lock) -> None:
+            group = [self.envs[lane] for lane in members if lane in moving]
+            with lock:
+                if group and started == self._round:
+                    group[0].advance(group, lanes)
+
+        try:
+            list(self._pool.map(advance, self._groups, self._members, self._locks))
+        finally:
+            self._await_threads()
         rewards, infos = np.zeros(self.num_envs), dict[str, Any]()
         terminated, truncated = np.zeros((2, self.num_envs), dtype=np.bool_)
         for lane, env in enumerate(self.envs):
@@ -160,13 +197,12 @@ class LaneVectorEnv(VectorEnv):
             if lane in moving:
                 seen, rewards[lane], terminated[lane], truncated[lane], info = env.finish()
                 truncated[lane] |= env.task.step_count >= self._step_limit
-                self._observations[lane], self._over[lane] = seen, terminated[lane] or truncated[lane]
-                if self._over[lane] and self.autoreset_mode is AutoresetMode.SAME_STEP:
+                self._observations[lane] = seen
+                if (terminated[lane] or truncated[lane]) and self.autoreset_mode is AutoresetMode.SAME_STEP:
                     enter_info(infos, {"final_obs": seen, "final_info": info}, lane, self.num_envs)
                     resets[lane] = True
             if resets[lane]:
                 self._observations[lane], info = env.reset()
-                self._over[lane] = False
             enter_info(infos, info, lane, self.num_envs)
         return self._together(), rewards, terminated, truncated, infos
 
@@ -189,18 +225,23 @@ class LaneVectorEnv(VectorEnv):
         for env in self.envs:
             env.close()
 
-    def _checked(self, actions: Any, moves: NDArray[np.bool_]) -> dict[int, FloatArray]:
-        """The checked actions of the moving lanes (n,), by lane."""
+    def _checked(self, actions: Any, moving: list[int], halts: list[str]) -> dict[int, FloatArray]:
+        """The checked actions of the moving lanes, by lane."""
         values = np.asarray(actions, dtype=np.float64)
         if values.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {values.shape}; the rule is {self.action_space.shape}")
-        moving = np.flatnonzero(moves).tolist()
-        for lane in moving:
-            if self._over[lane]:
-                raise gym.error.ResetNeeded(
-                    f"lane {lane}: the episode is over: reset it with options={{'reset_mask': mask}}, or pause it"
-                )
+        if halted := [lane for lane in moving if halts[lane]]:
+            alike = ", ".join(f"lane {lane}" for lane in halted if halts[lane] == halts[halted[0]])
+            raise gym.error.ResetNeeded(
+                f"{alike}: {halts[halted[0]]}: reset with options={{'reset_mask': mask}}, or pause(mask)"
+            )
         return {lane: self.envs[lane].checked(values[lane], lane) for lane in moving}
+
+    def _mask(self, values: Any, name: str) -> NDArray[np.bool_]:
+        mask = np.array(values)
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+            raise ValueError(f"{name} is {mask.dtype} {mask.shape}; the rule is bool ({self.num_envs},)")
+        return mask
 
     def _check_process(self) -> None:
         if (child := os.getpid()) != self._process:
@@ -209,6 +250,7 @@ class LaneVectorEnv(VectorEnv):
                 f"process {child} was forked from it, in which its threads do not run: make it in the child process, "
                 'with gym.make_vec in the worker\'s own function, or start workers with the method "spawn"'
             )
+        self._await_threads()
 
     def _together(self) -> Any:
         """The last observations of all environments."""

@@ -3,10 +3,12 @@
 import inspect
 import math
 import re
+import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -162,7 +164,7 @@ class Reward:
             step in which the episode ends with this name (see `Task.end`); "step left": the control steps left when
             the episode ends in failure, or `value` then
         meaning: for the table of rewards
-        value: function `(task, control_step)`, best in [0, 1]
+        value: function `(task, control_step)`, a finite number, best in [0, 1]
     """
 
     name: str
@@ -174,6 +176,8 @@ class Reward:
     def __post_init__(self) -> None:
         if self.per == "change" and self.value is None:
             raise ValueError(f"reward {self.name!r} pays a change, but has no value that could: give `value`")
+        if not math.isfinite(self.weight):
+            raise ValueError(f"reward {self.name!r}: weight is {self.weight}; it must be a finite number")
 
 
 @dataclass(frozen=True)
@@ -196,6 +200,21 @@ class Setup:
     episode_steps: int | None = 600
     load: Callable[[str], Scene] = make_scene
     drawn: type[Any] = DrawnOrgan
+
+
+def real_numbers(value: Any, owner: str, name: str) -> FloatArray:
+    """Numbers of a task's declaration as float64, of their own shape.
+
+    Raises:
+        ValueError: a value that is no real number or array of these; names its owner.
+    """
+    try:
+        numbers = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        numbers = np.array(None)
+    if numbers.dtype.kind not in "biuf":
+        raise ValueError(f"{owner} {name!r} gives {reprlib.repr(value)}; give real numbers")
+    return numbers.astype(np.float64, copy=False)
 
 
 def reward_weights(task_class: Any) -> dict[str, float]:

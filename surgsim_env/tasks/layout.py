@@ -9,7 +9,7 @@ from msdm_core.arithmetic import matmul
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.tasks.declaration import Channel, Command
+from surgsim_env.tasks.declaration import Channel, Command, real_numbers
 from surgsim_env.tasks.task import Task
 
 
@@ -20,6 +20,7 @@ class TaskLayout:
         action_slices: entries of an action, by the command's name
         observation_slices: entries of an observation, by the channel's name
         observed: channels of an observation, with their sizes
+        sensed: those with a sensor
     """
 
     def __init__(self, task: Task) -> None:
@@ -30,6 +31,11 @@ class TaskLayout:
         sized = ((channel, _size(channel, task)) for channel in task.channels)
         self.observed: tuple[tuple[Channel, int], ...] = tuple((channel, size) for channel, size in sized if size)
         self.observation_slices = _slices((channel.name, size) for channel, size in self.observed)
+        self.sensed = tuple(channel for channel, _ in self.observed if channel.sensor)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The task, laid out anew: the functions of its class's declaration cannot be pickled."""
+        return TaskLayout, (self._task,)
 
     # ---- actions -----------------------------------------------------------------------------------------------
 
@@ -95,20 +101,30 @@ class TaskLayout:
         """The observation (n_observation,) in SI units, with the last readings of the sensors.
 
         Raises:
-            ValueError: a channel's `read` returns a value of another size.
+            ValueError: a channel's `read` returns other than real numbers, or another size.
         """
-        return np.concatenate([self._read(channel, size, simulation) for channel, size in self.observed])
+        sensed = self._task.sensed
+        return np.concatenate(
+            [
+                sensed[channel.name] if channel.sensor else self.reading(channel, size, simulation)
+                for channel, size in self.observed
+            ]
+        )
 
-    def _read(self, channel: Channel, size: int, simulation: Simulation) -> FloatArray:
+    def reading(self, channel: Channel, size: int, simulation: Simulation) -> FloatArray:
+        """What a channel reads from the simulation, in front of its sensor, shape (size,).
+
+        Raises:
+            ValueError: other than real numbers, or another size.
+        """
         assert channel.read is not None
-        value = self._task.sensed[channel.name] if channel.sensor else channel.read(self._task, simulation)
-        flat = np.asarray(value, dtype=np.float64).ravel()
-        if flat.size != size:
+        values = real_numbers(channel.read(self._task, simulation), "channel", channel.name)
+        if values.size != size:
             raise ValueError(
-                f"channel {channel.name!r}: read returned {flat.size} numbers, shape {np.shape(value)}; its size is "
+                f"channel {channel.name!r}: read returned {values.size} numbers, shape {values.shape}; its size is "
                 f"{size}: return that many, or declare another size"
             )
-        return flat
+        return values.ravel()
 
     def bounds(self, instrument: Instrument | None) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the observation with an instrument, shape (n_observation,) each; all finite.
@@ -141,7 +157,8 @@ class TaskLayout:
         values = []
         for channel, size in self.observed:
             declared = getattr(channel, field)
-            value = np.asarray(declared(self._task, instrument) if callable(declared) else declared, dtype=np.float64)
+            given = declared(self._task, instrument) if callable(declared) else declared
+            value = real_numbers(given, f"{field} of channel", channel.name)
             if value.size not in (1, size) or not np.isfinite(value).all():
                 raise ValueError(
                     f"channel {channel.name!r}: {field} is {value.tolist()}; it must be one finite number or {size}, "

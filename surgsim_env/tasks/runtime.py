@@ -1,6 +1,8 @@
 """Episodes of a task: their draw, observation, judgement and saved state, from the task's declaration."""
 
+import base64
 import inspect
+import io
 import json
 import math
 from collections.abc import Mapping
@@ -9,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import TissueLoad
 from surgsim_env.coupling.sensors import ForceReading
@@ -21,7 +22,7 @@ from surgsim_env.scene.levels import find_level
 from surgsim_env.scene.load import with_instrument
 from surgsim_env.scene.model import ForceSensor
 from surgsim_env.scene.motions import with_motion
-from surgsim_env.tasks.declaration import ControlStep, Reward
+from surgsim_env.tasks.declaration import ControlStep, Reward, real_numbers
 from surgsim_env.tasks.layout import TaskLayout
 from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
@@ -29,6 +30,8 @@ from surgsim_env.tasks.task import InfoValue, Scenario, Task
 DRAWS_MOST = 20
 # Name of the end by tissue above the limits of pressure or strain.
 DAMAGE = "damage"
+# Ends that need no reward of their name: failures, a success, and an end that is neither.
+ENDS = ("fault", "hard_force", DAMAGE, "success", "done")
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,13 @@ class TaskRuntime:
         """Play the episodes of a task."""
         self.task, self.family = task, family
         self.layout = TaskLayout(task)
-        self._sensed = tuple(channel for channel, _ in self.layout.observed if channel.sensor)
         own = task.anatomy.scene.sensor
-        self.sensors = {channel.name: ForceReading(_scaled(own, channel.sensor)) for channel in self._sensed}
+        self.sensors = {channel.name: ForceReading(_scaled(own, channel.sensor)) for channel in self.layout.sensed}
         declared = [reward.name for reward in task.rewards if reward.per == "failure"]
         self.failures = tuple(dict.fromkeys(("fault", *declared, "hard_force", DAMAGE)))
+        # A subclass may leave out terms whose ends its base returns.
+        terms = [term for base in type(task).__mro__ for term in vars(base).get("rewards", ())]
+        self._ends = {*ENDS, *(term.name for term in terms if term.per in ("success", "failure"))}
         self.successes = ("success", *(reward.name for reward in task.rewards if reward.per == "success"))
         # Last values of the terms paid per change.
         self._reached: dict[str, float] = {}
@@ -86,13 +91,25 @@ class TaskRuntime:
         """Draw episodes until the task accepts one; organ and instrument are at rest.
 
         Raises:
-            ValueError: none of DRAWS_MOST draws is accepted.
+            ValueError: none of DRAWS_MOST draws is accepted, a tip inside the organ or without a finite position, or a
+                term paid per change without a finite value.
         """
+        name, shape = type(self.task).__name__, simulation.instrument.parked.shape
         for _ in range(DRAWS_MOST):
-            tip_position = self.draw(rng)
+            tip_position = real_numbers(self.draw(rng), "draw of", name)
+            if tip_position.shape != shape or not np.isfinite(tip_position).all():
+                raise ValueError(
+                    f"{name}.draw returned {tip_position.tolist()}; return the tip's position, finite numbers [m] of "
+                    f"shape {shape}"
+                )
             anatomy = self.task.anatomy
             simulation.take_anatomy(anatomy)
             simulation.reset(self.task.drawn.compiled(anatomy), tip_position)
+            if any(map(simulation.covers, tip_position.reshape(-1, 3))):
+                raise ValueError(
+                    f"{name}.draw puts the tip at {tip_position.tolist()} m, inside the organ: return a position "
+                    "outside it, such as a point of its surface plus the tip's radius along the normal"
+                )
             simulation.draw_motion(rng)
             if self.task.accepts(simulation):
                 self._reached = self._values(ControlStep(simulation))
@@ -118,7 +135,7 @@ class TaskRuntime:
         self.task.drawn, self.task.lesions = drawn, drawn.lesions
 
     def _draw_biases(self, rng: np.random.Generator, *, late: bool) -> None:
-        for channel in self._sensed:
+        for channel in self.layout.sensed:
             if channel.late_bias is late:
                 self.sensors[channel.name].reset(rng)
 
@@ -131,12 +148,11 @@ class TaskRuntime:
         """The observation (n_observation,) after a reset or a control step, and True if a sensor saturated.
 
         Raises:
-            ValueError: a channel's `read` returns a value of another size.
+            ValueError: a channel's `read` returns other than real numbers, or another size.
         """
         task, simulation, saturated = self.task, step.simulation, False
-        for channel in self._sensed:
-            assert channel.read is not None
-            value = np.asarray(channel.read(task, simulation), dtype=np.float64)
+        for channel in self.layout.sensed:
+            value = self.layout.reading(channel, 3, simulation)
             task.sensed[channel.name], cut = self.sensors[channel.name].read(value, rng, simulation.time)
             saturated = saturated or cut
         task.update(step)
@@ -145,9 +161,18 @@ class TaskRuntime:
     # ---- judgement ---------------------------------------------------------------------------------------------
 
     def judge(self, step: ControlStep) -> Verdict:
-        """Judgement of a control step, after its observation unless it has a fault."""
+        """Judgement of a control step, after its observation unless it has a fault.
+
+        Raises:
+            ValueError: a reward that is not finite, or an end that is not declared (names it).
+        """
         task, before = self.task, self._reached
         end = task.end(step)
+        if not isinstance(end, str) or (end and end not in self._ends):
+            raise ValueError(
+                f'{type(task).__name__}.end returned {end!r}; return "" while the episode goes on, else one of '
+                f"{', '.join(sorted(self._ends))}, or declare a reward of that name"
+            )
         load = step.simulation.tissue_load if task.limits.judges_tissue and not step.fault else None
         if load is not None and end not in self.failures and self._damages(load):
             end = DAMAGE
@@ -155,7 +180,8 @@ class TaskRuntime:
             self._reached = self._values(step)
         # Adding 0.0 turns a product of -0.0 into 0.0.
         rewards = {
-            reward.name: reward.weight * float(self._amount(reward, step, end, before)) + 0.0 for reward in task.rewards
+            reward.name: self._finite(reward, reward.weight * self._amount(reward, step, end, before) + 0.0)
+            for reward in task.rewards
         }
         truncated = not end and task.episode_steps is not None and task.step_count >= task.episode_steps
         return Verdict(bool(end), truncated, rewards, self._info(step, load, end))
@@ -172,10 +198,26 @@ class TaskRuntime:
     def _values(self, step: ControlStep) -> dict[str, float]:
         """Values of the terms paid per change."""
         return {
-            reward.name: float(reward.value(self.task, step))
+            reward.name: self._finite(reward, self._value(reward, step))
             for reward in self.task.rewards
-            if reward.per == "change" and reward.value is not None
+            if reward.per == "change"
         }
+
+    def _value(self, reward: Reward, step: ControlStep) -> float:
+        """Value of a term; 1 without one."""
+        value = 1.0 if reward.value is None else reward.value(self.task, step)
+        if type(value) is float:  # most are
+            return value
+        numbers = real_numbers(value, "reward", reward.name)
+        return numbers.item() if numbers.size == 1 else math.nan
+
+    def _finite(self, reward: Reward, number: float) -> float:
+        if not math.isfinite(number):
+            raise ValueError(
+                f"{type(self.task).__name__}, control step {self.task.step_count}: reward {reward.name!r} is {number}; "
+                "its value must be one number, finite also when it is weighted"
+            )
+        return number
 
     def _amount(self, reward: Reward, step: ControlStep, end: str, before: Mapping[str, float]) -> float:
         """Factor of a term's weight."""
@@ -191,7 +233,7 @@ class TaskRuntime:
             if reward.value is None:
                 assert task.episode_steps is not None
                 return float(task.episode_steps - task.step_count)
-        return 1.0 if reward.value is None else reward.value(task, step)
+        return self._value(reward, step)
 
     def _damages(self, load: TissueLoad) -> bool:
         """True if a load exceeds the scene's limits of pressure or strain."""
@@ -211,7 +253,7 @@ class TaskRuntime:
         """The draws and counts of the episode, as exact JSON.
 
         Raises:
-            TypeError: a `kept` attribute that is no number, text, array or list of these.
+            TypeError: a `kept` attribute of another type than `_kept_form` takes.
         """
         task = self.task
         assert task.drawn is not None
@@ -219,26 +261,29 @@ class TaskRuntime:
             "drawn": task.drawn.to_json(),
             "step_count": task.step_count,
             "bias": {name: sensor.get_state() for name, sensor in self.sensors.items()},
-            "sensed": task.sensed,
+            "sensed": {name: _kept_form(value, name) for name, value in task.sensed.items()},
             "reached": self._reached,
-            "kept": {name: getattr(task, name) for name in task.kept},
+            "kept": {name: _kept_form(getattr(task, name), name) for name in task.kept},
         }
-        return json.dumps(state, default=_array_table)
+        return json.dumps(state)
 
-    def saved_organ(self, text: str, anatomy: Anatomy) -> OrganModel:
-        """The organ of a saved episode; changes nothing.
+    def read_state(self, text: str, anatomy: Anatomy) -> dict[str, Any]:
+        """The contents of a saved episode, `drawn` its organ; changes nothing.
 
         Args:
             text: from `get_state`.
             anatomy: of the episode: of a family that member's, else the task's own.
         """
-        return self.task.setup.drawn.from_json(json.loads(text)["drawn"], anatomy).compiled(anatomy)
+        saved = json.loads(text)
+        for part in ("sensed", "kept"):
+            saved[part] = {name: _kept_value(form) for name, form in saved[part].items()}
+        return {**saved, "drawn": self.task.setup.drawn.from_json(saved["drawn"], anatomy)}
 
-    def set_state(self, text: str, anatomy: Anatomy) -> None:
-        """Restore a state of `get_state`, accepted by `saved_organ`, with the anatomy of its episode."""
-        task, saved = self.task, json.loads(text, object_hook=_array_of)
+    def set_state(self, saved: Mapping[str, Any], anatomy: Anatomy) -> None:
+        """Restore the contents of a saved episode from `read_state`, with its anatomy."""
+        task = self.task
         task.anatomy = anatomy
-        self._take(task.setup.drawn.from_json(saved["drawn"], anatomy))
+        self._take(saved["drawn"])
         task.step_count, task.sensed, self._reached = saved["step_count"], saved["sensed"], saved["reached"]
         for name, state in saved["bias"].items():
             self.sensors[name] = ForceReading(self.sensors[name].sensor, state)
@@ -297,18 +342,41 @@ def _scaled(sensor: ForceSensor, factor: float) -> ForceSensor:
     return ForceSensor(*(factor * number for number in numbers))
 
 
-def _array_table(value: Any) -> Any:
-    """JSON form of an array or a number of numpy's in a saved state."""
-    if isinstance(value, np.ndarray):
-        return {"array": value.tolist(), "dtype": str(value.dtype)}
-    if isinstance(value, np.generic):
-        return value.item()
+def _kept_form(value: Any, name: str) -> Any:
+    """JSON form of a kept attribute; arrays and numpy's scalars in numpy's own file format, in base64.
+
+    Raises:
+        TypeError: a type whose values `_kept_value` would not give back exactly; names the attribute.
+    """
+    kind = type(value)
+    if value is None or kind in (bool, int, float, str):
+        return value
+    if kind is list:
+        return [_kept_form(entry, name) for entry in value]
+    if kind is tuple:
+        return {"tuple": _kept_form(list(value), name)}
+    if kind is dict:
+        return {"dict": _kept_form(list(value.items()), name)}
+    if (kind is np.ndarray or isinstance(value, np.generic)) and not value.dtype.hasobject:
+        buffer = io.BytesIO()
+        np.save(buffer, value, allow_pickle=False)
+        return {"array" if kind is np.ndarray else "scalar": base64.b64encode(buffer.getvalue()).decode()}
     raise TypeError(
-        f"a kept attribute holds a {type(value).__name__}; a saved state holds numbers, texts, arrays and lists of "
-        "these: keep such, and make the rest from them"
+        f"kept attribute {name!r} holds a {kind.__name__}; a saved state holds numbers, texts, numpy's arrays and "
+        "scalars, and lists, tuples and dictionaries of these: keep such, and make the rest from them"
     )
 
 
-def _array_of(table: dict[str, Any]) -> Any:
-    """Array of a table from `_array_table`; any other table unchanged."""
-    return np.array(table["array"], table["dtype"]) if table.keys() == {"array", "dtype"} else table
+def _kept_value(form: Any) -> Any:
+    """Value of a form from `_kept_form`, of the same type and bits."""
+    if isinstance(form, list):
+        return [_kept_value(entry) for entry in form]
+    if not isinstance(form, dict):
+        return form
+    ((kind, content),) = form.items()
+    if kind == "tuple":
+        return tuple(_kept_value(content))
+    if kind == "dict":
+        return dict(_kept_value(content))
+    array = np.load(io.BytesIO(base64.b64decode(content)), allow_pickle=False)
+    return array if kind == "array" else array[()]

@@ -106,7 +106,7 @@ class Task:
         self.episode_steps = self.setup.episode_steps
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
-        """Draw an episode beside its organ; returns the tip's position [m] (3,), of two arms (2, 3).
+        """Draw an episode beside its organ; returns the tip's position [m] outside it, (3,), of two arms (2, 3).
 
         `anatomy`, `drawn` and `lesions` are those of the episode.
         """
@@ -126,7 +126,9 @@ class Task:
     def end(self, step: ControlStep) -> str:
         """Reason of the episode's end in this control step; "" while it goes on. Called once for each.
 
-        A declared reward of that name is paid. Failures are "fault", "hard_force", "damage" and the declared ones.
+        It is the name of a declared reward of success or failure, which is then paid, or "fault", "hard_force",
+        "damage", "success" or "done", which need none. Failures are "fault", "hard_force", "damage" and the declared
+        ones.
         """
         if step.fault:
             return "fault"

@@ -73,6 +73,24 @@ def test_other_threads_run_meanwhile():
 # ---- where it cannot be had ----------------------------------------------------------------------------------------
 
 
+def test_numbas_own_switch_runs_the_loop_in_python_with_the_same_bits():
+    code = """
+import gymnasium as gym, hashlib, numba, numpy as np, surgsim_env
+own = numba.njit(lambda x: x)
+env = gym.make("SurgSim/Palpate-v0", scene="phantom_small").unwrapped
+env.reset(seed=1)
+for _ in range(3):
+    env.step(np.array([0.0, 0.0, -1.0, 0.0], dtype=np.float32))
+print(hasattr(own, "py_func"), env.simulation.compiled, hashlib.sha256(env.save_state()).hexdigest())
+"""
+    printed = []
+    for disabled in ("1", "0"):
+        settings = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        printed.append(subprocess.check_output([sys.executable, "-c", code], env=settings, text=True).split())
+    assert [entries[:2] for entries in printed] == [["False", "False"], ["True", "True"]]
+    assert printed[0][2] == printed[1][2]
+
+
 def test_a_missing_library_has_a_reason(tmp_path):
     assert "no library of MuJoCo" in mujoco_library.load_library(tmp_path)
     (tmp_path / "libmujoco.so.9").write_text("no library")

@@ -1,5 +1,7 @@
 """Two agents of one bimanual retraction, as PettingZoo has them: its own tests, and equality with the joint one."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -16,6 +18,15 @@ def env():
 
 def test_passes_pettingzoos_own_test(env):
     parallel_api_test(env, num_cycles=20)
+
+
+def test_a_pickled_environment_goes_on_as_it_does(env):
+    env.reset(seed=3)
+    still = {agent: np.zeros(env.action_space(agent).shape, dtype=np.float32) for agent in env.agents}
+    env.step(still)
+    twin = pickle.loads(pickle.dumps(env))
+    result, other = env.step(still), twin.step(still)
+    assert result[0]["left"].tobytes() == other[0]["left"].tobytes() and result[1:] == other[1:]
 
 
 def test_seeds_repeat():

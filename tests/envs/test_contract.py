@@ -3,7 +3,9 @@
 One of them is the task of docs/tutorials/own_task.md, a file outside the package.
 """
 
+import copy
 import io
+import pickle
 import warnings
 
 import gymnasium as gym
@@ -154,6 +156,19 @@ def test_saved_state_resumes_to_the_bit_in_the_same_and_in_another_environment(m
         assert_same(expected, go_on(environment))
         # The random generator went on as well: the next episode is the same too.
         assert_same([next_start], [environment.reset()])
+
+
+def test_pickled_environments_go_on_to_the_bit_as_copies_do(made):
+    env, fresh = made(), pickle.loads(pickle.dumps(made()))
+    steps = 10 // SHORTER.get(env.spec.id, 1)
+    walked = rollout(env, seed=5, steps=steps)
+    assert_same(walked, rollout(fresh, seed=5, steps=steps))
+    twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    action = np.full(env.action_space.shape, -0.2, dtype=np.float32)
+    expected = [env.step(action), env.step(action), env.reset()]
+    for twin in twins:
+        assert_same(expected, [twin.step(action), twin.step(action), twin.reset()])
+        assert twin.unwrapped.save_state() == env.unwrapped.save_state()
 
 
 def test_foreign_or_broken_states_are_refused(made, tmp_path):

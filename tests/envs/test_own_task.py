@@ -116,7 +116,7 @@ def test_a_small_task_has_arguments_level_end_state_and_lanes(registered):
     env.step(down)
     saved = env.save_state()
     kept = env.task.place.copy()
-    expected = [env.step(down) for _ in range(20) if env._running]
+    expected = [env.step(down) for _ in range(20) if not env.halted]
     assert expected[-1][2] and expected[-1][-1]["success"] and expected[-1][-1]["reward_success"] == 1.0
     env.reset(seed=9)
     env.load_state(saved)
@@ -256,3 +256,151 @@ def test_a_channel_that_leaves_its_bounds_later_is_a_fault():
     observation, _, terminated, _, info = env.step(np.zeros(3, dtype=np.float32))
     assert terminated and info["sim_fault"] == "observation one[0] = 1.5 left its bounds, 0 to 1"
     np.testing.assert_array_equal(observation, first)
+
+
+# ---- a task's own numbers, ends and draws ----------------------------------------------------------------------------
+
+STILL = np.zeros(3, dtype=np.float32)
+
+
+def played(**attributes):
+    """An environment of `Touch` with other attributes, one step after a reset."""
+    env = environment_class(type("Own", (Touch,), attributes))()
+    env.reset(seed=1)
+    return env, env.step(STILL)
+
+
+@pytest.mark.parametrize("per", ["step", "change"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1j, np.complex128(1.0), None, "1", np.ones(2), []])
+def test_a_reward_that_is_no_finite_number_is_named(value, per):
+    late = lambda task, step: value if task.step_count else 0.0  # noqa: E731
+    for amount in (late, lambda task, step: value):
+        with pytest.raises(ValueError, match="'odd'"):
+            played(rewards=(Reward("time", -1.0, "step"), Reward("odd", 1.0, per, "", amount)))
+
+
+@pytest.mark.parametrize("weight", [np.nan, np.inf])
+def test_a_weight_that_is_not_finite_is_refused(weight):
+    with pytest.raises(ValueError, match="'odd'"):
+        Reward("odd", weight, "step")
+
+
+@pytest.mark.parametrize("value", [0.5, np.float32(0.5), np.array(0.5), True, 2])
+def test_numbers_of_any_kind_are_paid(value):
+    _, (_, reward, *_, info) = played(rewards=(Reward("own", 2.0, "step", "", lambda *_: value),))
+    assert reward == info["reward_own"] == 2.0 * float(value) and type(reward) is float
+
+
+@pytest.mark.parametrize("end", [True, 1, None, ["success"], np.array(["success"]), b"success", "sucess", "time"])
+def test_an_end_that_is_not_declared_is_named(end):
+    with pytest.raises(ValueError, match=r"Own\.end"):
+        played(end=lambda self, step: end)
+
+
+@pytest.mark.parametrize("end", ["", "success", "done", "damage", "torn"])
+def test_a_declared_end_ends_the_episode(end):
+    rewards = (*Touch.rewards, Reward("torn", -3.0, "failure"))
+    _, (_, reward, terminated, _, info) = played(end=lambda self, step: end, rewards=rewards)
+    assert (terminated, info["success"]) == (end != "", end == "success")
+    assert reward == {"success": 0.0, "torn": -4.0}.get(end, -1.0)
+
+
+@pytest.mark.parametrize(
+    "tip",
+    [
+        lambda point, normal: point - 0.01 * normal,
+        lambda point, normal: point - 0.0005 * normal,
+        lambda point, normal: point * np.nan,
+        lambda point, normal: point + 0.012 * normal + 1j,
+        lambda point, normal: (point + 0.012 * normal)[:2],
+        lambda point, normal: 0.05,
+        lambda point, normal: None,
+    ],
+)
+def test_a_tip_inside_the_organ_or_nowhere_is_named(tip):
+    with pytest.raises(ValueError, match=r"draw.*Own|Own\.draw"):
+        played(draw=lambda self, rng: tip(*self.anatomy.face.random_point(rng, 0.01)))
+
+
+def test_after_a_reset_that_raised_nothing_is_played_or_saved():
+    env, _ = played()
+    draw = env.task.draw
+    env.task.draw = lambda rng: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        env.reset()
+    for call in (lambda: env.step(STILL), env.save_state):
+        with pytest.raises(gym.error.ResetNeeded):
+            call()
+    env.task.draw = draw
+    env.reset()
+    env.step(STILL)
+
+
+@pytest.mark.parametrize(
+    "value", [0.5 + 0.1j, np.complex64(0.5), "0.5", None, [0.5, [0.1]], np.array([0.5], dtype=object)]
+)
+def test_a_read_that_is_no_real_number_is_named(value):
+    with pytest.raises(ValueError, match="'one'"):
+        played(channels=(CONTACT_FORCE, channel(read=lambda *_: value)))
+
+
+@pytest.mark.parametrize("value", [1.0, np.ones(1), np.ones(2), np.ones(3) * 1j])
+def test_a_read_in_front_of_a_sensor_has_three_real_numbers(value):
+    force = Channel("force", 3, "N", sensor=1.0, scale=1.0, read=lambda *_: value)
+    with pytest.raises(ValueError, match="'force'"):
+        played(channels=(force,))
+
+
+# ---- kept attributes -------------------------------------------------------------------------------------------------
+
+KEPT = [
+    *(np.zeros((0, 3)), np.zeros((2, 0), np.float32), np.array(3.0), np.ones(2) * 1j, np.ones(2, np.longdouble) / 3.0),
+    *(np.array(["2026-01-01", "NaT"], "datetime64[D]"), np.arange(3, dtype=">i4"), np.array(["a", "bcd"])),
+    *(np.zeros(2, [("a", "f8"), ("b", "i4")]), np.asfortranarray(np.arange(6.0).reshape(2, 3))),
+    *(np.float32(0.1), np.float64(0.1), np.int64(7), np.bool_(True), np.datetime64("NaT"), np.timedelta64(3, "s")),
+    *(np.nan, -0.0, 10**30, True, None, "a\0b"),
+    *((1, 2.0), [(1, np.ones(1)), []], (), {}, {1: 2, (1, 2): [3]}, {"array": [1], "dtype": "f8"}, {"tuple": 1}),
+]
+
+
+def identical(value, other):
+    if type(value) is not type(other):
+        return False
+    if isinstance(value, np.ndarray | np.generic):
+        return value.dtype == other.dtype and value.shape == other.shape and value.tobytes() == other.tobytes()
+    if isinstance(value, list | tuple):
+        return len(value) == len(other) and all(map(identical, value, other))
+    if isinstance(value, dict):
+        return identical(list(value.items()), list(other.items()))
+    return repr(value) == repr(other)
+
+
+@pytest.mark.parametrize("value", KEPT, ids=repr)
+def test_kept_values_come_back_as_they_were(value):
+    env, _ = played(kept=("thing",), update=lambda self, step: setattr(self, "thing", value))
+    saved = env.save_state()
+    env.task.thing = "another"
+    env.load_state(saved)
+    assert identical(env.task.thing, value) and env.save_state() == saved
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(
+            np.array([None]),
+            np.ma.array([1], mask=[1]),
+            np.zeros(2, [("a", "O")]),
+            {1},
+            b"a",
+            len,
+            np.random.default_rng(0),
+        ),
+        *(1j, [1, {1}], {"a": (b"a",)}),
+    ],
+    ids=repr,
+)
+def test_kept_values_that_would_change_are_refused_by_name(value):
+    env, _ = played(kept=("thing",), update=lambda self, step: setattr(self, "thing", value))
+    with pytest.raises(TypeError, match="'thing'"):
+        env.save_state()

@@ -1,5 +1,7 @@
 """Environments side by side give what each would give alone: held against gymnasium's SyncVectorEnv, to the bit."""
 
+import copy
+import pickle
 import sys
 from typing import Any
 
@@ -200,10 +202,10 @@ def test_an_ended_episode_is_refused_in_mode_disabled():
     envs.reset(seed=0)
     still = np.zeros((COUNT, 4), dtype=np.float32)
     assert envs.step(still)[3].all()
-    with pytest.raises(gym.error.ResetNeeded, match="lane 0: the episode is over: reset it with options="):
+    with pytest.raises(gym.error.ResetNeeded, match="lane 0, lane 1, lane 2: the episode is over"):
         envs.step(still)
     envs.reset(options={"reset_mask": np.array([True, False, False])})
-    with pytest.raises(gym.error.ResetNeeded, match="lane 1: the episode is over"):
+    with pytest.raises(gym.error.ResetNeeded, match=r"^lane 1, lane 2: the episode is over"):
         envs.step(still)
 
 
@@ -222,6 +224,36 @@ def test_an_ended_episode_is_refused_in_mode_disabled():
 def test_a_reset_that_does_not_fit_is_refused(given: dict, message: str):
     with pytest.raises(ValueError, match=message):
         side_by_side().reset(**given)
+
+
+def test_a_pause_that_does_not_fit_is_refused():
+    for mask in (np.ones(2, dtype=np.bool_), np.ones(3)):
+        with pytest.raises(ValueError, match="mask is "):
+            side_by_side().pause(mask)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("num_envs", value) for value in (0, -1, "4", 2.0, None)),
+        *(("threads", value) for value in (0, 1.5, "2")),
+        *(("max_episode_steps", value) for value in (0, 1.5, "3")),
+        *(("dtype", value) for value in ("FLOAT64", "float16", None)),
+        *(("autoreset_mode", value) for value in ("foo", None, 1)),
+    ],
+)
+def test_wrong_arguments_are_named(name: str, value: object):
+    with pytest.raises(ValueError) as error:
+        vector_class(PalpateEnv)(**{"num_envs": 2, "scene": "phantom_small", name: value})
+    assert name in str(error.value) and repr(value) in str(error.value)
+
+
+@pytest.mark.parametrize("duplicate", [pickle.dumps, copy.deepcopy])
+def test_a_vector_environment_refuses_a_copy_and_its_environments_give_one(duplicate):
+    envs = side_by_side()
+    with pytest.raises(TypeError, match="PalpateVectorEnv"):
+        duplicate(envs)
+    duplicate(envs.envs)
 
 
 def test_compiled_code_is_three_calls_below_step(monkeypatch: pytest.MonkeyPatch):

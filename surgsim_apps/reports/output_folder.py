@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import fcntl
 import itertools
 import os
 import shutil
@@ -110,9 +111,7 @@ def _room_in(folder: Path) -> Iterator[None]:
 def interrupts() -> Iterator[None]:
     """SIGTERM, and SIGHUP of a closed terminal, as KeyboardInterrupt within a `with`: it ends as by Ctrl-C."""
     # `nohup` ignores SIGHUP, and only the main thread may handle signals.
-    # Windows has no SIGHUP.
-    known = [signal.Signals[name] for name in ("SIGTERM", "SIGHUP") if name in signal.Signals.__members__]
-    possible = known if threading.current_thread() is threading.main_thread() else []
+    possible = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
     signals = [number for number in possible if signal.getsignal(number) is signal.SIG_DFL]
 
     def interrupt(*_: object) -> None:
@@ -137,9 +136,6 @@ def lone_run(result: Path) -> Iterator[None]:
     Raises:
         OSError: another run writes it, or its folder cannot be written.
     """
-    # POSIX alone has it; commands start without it.
-    import fcntl
-
     place = result.resolve()
     place.parent.mkdir(parents=True, exist_ok=True)
     lock = place.with_name(f".{place.name}.lock")

@@ -148,15 +148,17 @@ class _Finder:
 
     def _limits(self) -> list[tuple[float, float]]:
         limits = []
-        self.given_limits: dict[str, tuple[float, float]] = {}
+        crossed = self.survey.crossed
+        self.given_limits = {name: crossed[name] for name in self.names if name in crossed}
         for joint, name in zip(self.chain, self.names, strict=True):
             slides = self.model.jnt_type[joint] == SLIDE
             limits.append(self.survey.range_of(joint, SLIDE_RANGE if slides else TURN_RANGE))
             if not self.model.jnt_limited[joint]:
                 self.given_limits[name] = (round(limits[-1][0], 9), round(limits[-1][1], 9))
-        if self.given_limits:
+        free = [name for name in self.given_limits if name not in crossed]
+        if free:
             self.chosen.append(
-                f"joints without limits ({', '.join(self.given_limits)}) get one turn to either side, or -0.5 to 0.5 m"
+                f"joints without limits ({', '.join(free)}) get one turn to either side, or -0.5 to 0.5 m"
             )
         return limits
 
@@ -164,11 +166,14 @@ class _Finder:
         survey = self.survey
         self.notes.append(f"chain of {len(self.chain)} joints: {', '.join(self.names)}")
         self.notes.append(f"its end: {survey.body_name(body)}")
-        if survey.dropped_meshes:
-            self.chosen.append(
-                f"{len(survey.dropped_meshes)} meshes are left out, not found or not read by MuJoCo: "
-                f"{_listed(survey.dropped_meshes)}"
-            )
+        if survey.left_out:
+            self.chosen.append(f"shapes left out ({len(survey.left_out)}): {_listed(survey.left_out)}")
+        if survey.crossed:
+            pairs = [f"{name} {low:g} to {high:g}" for name, (low, high) in survey.crossed.items()]
+            self.chosen.append(f"limits whose lower is above the upper one are used in order: {_listed(pairs)}")
+        if survey.locked:
+            values = [f"{name} at {value:g}" for name, value in survey.locked.items()]
+            self.chosen.append(f"joints with equal limits, and those coupled to them, are held there: {_listed(values)}")
         if survey.inertias:
             self.chosen.append(
                 "links without a valid inertia get that of a block around their shapes: "
@@ -575,7 +580,7 @@ class _Finder:
             control=control,
             home={name: round(float(value), 9) + 0.0 for name, value in zip(self.names, home, strict=True)},
             limits=self.given_limits,
-            held=self._held(home),
+            held={**survey.locked, **self._held(home)},
             shapes=(*tool.shapes, *link_shapes),
             inertias=survey.inertias,
             dropped_meshes=survey.dropped_meshes,
@@ -594,8 +599,9 @@ class _Finder:
         arm = self._search_arm(link_shapes)
         control = self._control(arm, clipped)
         description = self._description(link_shapes, control, clipped, point, into)
-        if description.held:
-            self.chosen.append(f"joints that do not move the tip are held: {_listed(list(description.held))}")
+        held = [name for name in description.held if name not in self.survey.locked]
+        if held:
+            self.chosen.append(f"joints that do not move the tip are held: {_listed(held)}")
         if self.centre is None and self.trocar_given is None:
             self.chosen.append(f"trocar at {vector(point, 4)} m of the model's frame; --trocar x,y,z sets another one")
         self.notes.append(

@@ -11,7 +11,7 @@ import numpy as np
 from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
-from surgsim_env.instruments import MESH_FORMATS, find_mesh, mesh_names, read_model, read_xml
+from surgsim_env.instruments import hold_joints, read_model, read_xml, shape_faults, warned
 from surgsim_env.scene import LinkInertia, Vector, nearest
 
 # Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.
@@ -22,11 +22,14 @@ BARE_MASS = 0.01
 THICKNESS_LEAST = 0.002
 # A part is a straight shaft if it is this long and no thicker [m].
 SHAFT_LENGTH_LEAST, SHAFT_RADIUS_MOST = 0.10, 0.008
+# Largest size of a shape and distance of a link from its parent, smallest size of a mesh [m]: beyond, a unit is wrong.
+LENGTH_MOST, MESH_LEAST = 5.0, 0.001
 # Largest distance of axes from their meeting point [m].
 MEETING_TOLERANCE = 1e-4
 # Words in the names of frames at a tool's tip.
 TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
 # As numbers: a numpy integer equals no member of MuJoCo's enumerations.
+COUPLING = int(mujoco.mjtEq.mjEQ_JOINT)
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 SPHERE, CAPSULE, CYLINDER, ELLIPSOID, BOX, MESH, PLANE, FIELD = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
@@ -78,7 +81,10 @@ class ModelSurvey:
         path: of the file
         inertias: made from shapes for those missing or wrong in a URDF
         dropped_meshes: of a URDF, missing or unreadable
+        left_out: a sentence on each shape of a URDF that is left out
         speed_limits: of a URDF [rad/s or m/s]
+        locked: values of joints with equal limits, and of those coupled to them [rad or m]; taken out of the model
+        crossed: limits of joints in whose file the lower is above the upper one, in order [rad or m]
         model, data: of MuJoCo, at the model's initial joint values
     """
 
@@ -86,34 +92,77 @@ class ModelSurvey:
         """Read and compile a file.
 
         Raises:
-            ValueError: a missing file, no MJCF or URDF, or a file that MuJoCo refuses.
+            ValueError: a missing file, no MJCF or URDF, a file that MuJoCo refuses, a size of no arm.
         """
         self.path = path
         root = read_xml(path)
         self.is_urdf = root.tag == "robot"
         self.inertias: tuple[LinkInertia, ...] = ()
         self.dropped_meshes: tuple[str, ...] = ()
+        self.left_out: list[str] = []
+        self.locked: dict[str, float] = {}
+        self.crossed: dict[str, tuple[float, float]] = {}
         self.speed_limits: dict[str, float] = {}
         if self.is_urdf:
-            folder = (root.find("mujoco/compiler") or {}).get("meshdir", "")
-            files = {name: find_mesh(path, name, folder) for name in mesh_names(root)}
-            self.dropped_meshes = tuple(
-                name for name, file in files.items() if file is None or file.suffix.lower() not in MESH_FORMATS
-            )
+            dropped, self.left_out = shape_faults(root, path)
+            self.dropped_meshes = tuple(dropped)
             self.speed_limits = speed_limits(root)
             faults = faulty_links(root)
             ball = [LinkInertia(name, 1.0, (0.0, 0.0, 0.0), (1e-3, 1e-3, 1e-3)) for name in faults]
             self._compile(ball)
             self.inertias = tuple(self._solid_link(name, *faults[name]) for name in faults)
         self._compile(self.inertias)
+        self.locked, self.crossed = self._locked(), self._crossed()
+        if self.locked:
+            self._compile(self.inertias)
+        for name, limits in self.crossed.items():
+            self.model.joint(name).range, self.model.joint(name).limited = limits, 1
+        self._check_sizes()
 
     def _compile(self, inertias: Sequence[LinkInertia]) -> None:
         try:
-            self.model = read_model(self.path, inertias, self.dropped_meshes).compile()
+            with warned(f"arm {self.path.stem!r}"):
+                spec = read_model(self.path, inertias, self.dropped_meshes)
+                hold_joints(spec, self.locked)
+                self.model = spec.compile()
         except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
             raise ValueError(f"model file {self.path}: {' '.join(str(error).split())}") from None
         self.data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, self.data)
+
+    def _crossed(self) -> dict[str, tuple[float, float]]:
+        ranges = {self.model.joint(j).name: self.model.jnt_range[j] for j in range(self.model.njnt)}
+        return {name: (float(upper), float(lower)) for name, (lower, upper) in ranges.items() if lower > upper}
+
+    def _locked(self) -> dict[str, float]:
+        """Joints with equal limits, of which 0 and 0 state none, and those that follow them."""
+        model = self.model
+        low, high = model.jnt_range.T
+        values = {int(joint): float(low[joint]) for joint in np.flatnonzero((low == high) & (low != 0.0))}
+        for _ in range(model.neq):
+            for index in np.flatnonzero(model.eq_type == COUPLING):
+                follower, master = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
+                if master in values:
+                    offset, factor = model.eq_data[index, :2]
+                    values.setdefault(follower, float(offset + factor * values[master]))
+        return {model.joint(joint).name: value for joint, value in values.items()}
+
+    def _check_sizes(self) -> None:
+        model = self.model
+        for body in range(1, model.nbody):
+            where = f"model file {self.path}: link {self.body_name(body)}"
+            parent, away = int(model.body_parentid[body]), float(norm(model.body_pos[body]))
+            if parent and away > LENGTH_MOST:
+                raise ValueError(f"{where} is {away:.3g} m away from {self.body_name(parent)}: is that in mm?")
+            for geom in self.body_geoms(body):
+                points = self.geom_points(geom)
+                if not len(points):
+                    continue
+                length = float(np.ptp(points, axis=0).max())
+                if length > LENGTH_MOST:
+                    raise ValueError(f"{where} is {length:.3g} m long: scale 0.001 missing?")
+                if model.geom_type[geom] == MESH and length < MESH_LEAST:
+                    raise ValueError(f"{where} has a mesh only {length:.1g} m long: scale 0.001 applied twice?")
 
     def _solid_link(self, name: str, mass: float, centre: FloatArray) -> LinkInertia:
         """Mass and moments of a solid block around a link's shapes, or of a cube for a link without one."""

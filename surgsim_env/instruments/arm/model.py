@@ -14,7 +14,7 @@ import numpy as np
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh_files.mesh_file import checked_content
 from msdm_core.organ.support import Support
-from surgsim_env.instruments.arm.urdf import prepare_urdf
+from surgsim_env.instruments.arm.urdf import check_numbers, import_mesh, prepare_urdf
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
@@ -93,14 +93,20 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
     """
     root = read_xml(path)
     if root.tag == "robot":
-        prepare_urdf(root, path, inertias, dropped_meshes)
+        limits = prepare_urdf(root, path, inertias, dropped_meshes)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         spec.modelfiledir = str(path.parent)
+        for joint, pair in limits.items():
+            spec.joint(joint).range, spec.joint(joint).limited = pair, mujoco.mjtLimited.mjLIMITED_FALSE
     elif inertias or dropped_meshes:
         name = "inertias" if inertias else "dropped_meshes"
         raise ValueError(f"{name} is for URDF files; model file {path} is MJCF: change it there")
     else:
         spec = mujoco.MjSpec.from_file(str(path))
+    for mesh in spec.meshes:
+        file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
+        if file.is_file():
+            import_mesh(mesh, file)
     return spec
 
 
@@ -108,18 +114,22 @@ def read_xml(path: Path) -> ElementTree.Element:
     """Read the root element of a model file.
 
     Raises:
-        ValueError: an unreadable file, one larger than FILE_SIZE_MOST, or one without valid XML.
+        ValueError: an unreadable file, one larger than FILE_SIZE_MOST, one without valid XML, a URDF with text in place
+            of a number.
     """
     checked_content(path)
     try:
         size = path.stat().st_size
         if size > FILE_SIZE_MOST:
             raise ValueError(f"model file {path} has {size} bytes; at most {FILE_SIZE_MOST} are read: reduce it")
-        return ElementTree.fromstring(path.read_bytes())
+        root = ElementTree.fromstring(path.read_bytes())
     except OSError as error:
         raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
     except ElementTree.ParseError as error:
         raise ValueError(f"model file {path} is not valid XML: {error}") from None
+    if root.tag == "robot":
+        check_numbers(root, path)
+    return root
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:

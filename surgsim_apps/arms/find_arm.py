@@ -166,8 +166,8 @@ class _Finder:
         survey = self.survey
         self.notes.append(f"chain of {len(self.chain)} joints: {', '.join(self.names)}")
         self.notes.append(f"its end: {survey.body_name(body)}")
-        if survey.left_out:
-            self.chosen.append(f"shapes left out ({len(survey.left_out)}): {_listed(survey.left_out)}")
+        for fault, places in survey.left_out.items():
+            self.chosen.append(f"shapes left out: {_listed(places)} ({fault})")
         if survey.crossed:
             pairs = [f"{name} {low:g} to {high:g}" for name, (low, high) in survey.crossed.items()]
             self.chosen.append(f"limits whose lower is above the upper one are used in order: {_listed(pairs)}")
@@ -410,8 +410,8 @@ class _Finder:
         if best is None:
             what = "the trocar" if self.trocar_given is None else f"the trocar at {vector(self.trocar_given, 4)}"
             raise ValueError(
-                f"model file {self.survey.path}: no pose was found with the shaft in {what} and the tip "
-                f"{1e3 * HOME_DEPTH:.0f} mm past it: move it with --trocar, or name another --tip"
+                f"model file {self.survey.path}: no pose was found with the shaft in {what}, the tip "
+                f"{1e3 * HOME_DEPTH:.0f} mm past it and the tool outside other links: move it with --trocar, or name another --tip"
             )
         return best
 
@@ -468,8 +468,14 @@ class _Finder:
         return (1.0 - arm.tip_direction(pose)[2]) * min(float(margin.min()) / 0.1, 1.0) * least
 
     def _blocked(self, arm: Arm, joints: FloatArray) -> bool:
-        """True if the tool passes through a link other than its carrier or the links next to it."""
-        carriers = {self.survey.body_name(part) for part in self.survey.parents(self.tool.shaft_body)[:3]}
+        """True if the tool passes through a link other than its carrier, those beyond or the two before it."""
+        survey, end = self.survey, int(self.model.jnt_bodyid[self.chain[-1]])
+        # Frames fixed to a link count with it, and so do the fingers of a hand that holds the tool.
+        parents = survey.parents(self.tool.shaft_body)
+        last = [*(part for part in parents if survey.body_joints(part)), parents[-1]][:3][-1]
+        near = {*parents[: parents.index(last) + 1]}
+        near |= {part for part in range(1, self.model.nbody) if end in survey.parents(part)}
+        carriers = {survey.body_name(part) for part in near}
         model, data = arm.model, mujoco.MjData(arm.model)
         arm.write(data, joints)
         mujoco.mj_kinematics(model, data)

@@ -81,7 +81,7 @@ class ModelSurvey:
         path: of the file
         inertias: made from shapes for those missing or wrong in a URDF
         dropped_meshes: of a URDF, missing or unreadable
-        left_out: a sentence on each shape of a URDF that is left out
+        left_out: links and meshes of a URDF's shapes that are left out, by reason
         speed_limits: of a URDF [rad/s or m/s]
         locked: values of joints with equal limits, and of those coupled to them [rad or m]; taken out of the model
         crossed: limits of joints in whose file the lower is above the upper one, in order [rad or m]
@@ -99,7 +99,7 @@ class ModelSurvey:
         self.is_urdf = root.tag == "robot"
         self.inertias: tuple[LinkInertia, ...] = ()
         self.dropped_meshes: tuple[str, ...] = ()
-        self.left_out: list[str] = []
+        self.left_out: dict[str, list[str]] = {}
         self.locked: dict[str, float] = {}
         self.crossed: dict[str, tuple[float, float]] = {}
         self.speed_limits: dict[str, float] = {}

@@ -134,42 +134,43 @@ def _shapes(root: ElementTree.Element) -> list[tuple[ElementTree.Element, Elemen
 
 
 def shape_fault(shape: ElementTree.Element) -> str | None:
-    """Reason for leaving out a visual or collision element, a shape without extent; None for a good one."""
+    """Reason for leaving out a visual or collision element that is no mesh; None for a shape with an extent."""
     geometry = shape.find("geometry")
     solid = None if geometry is None else next(iter(geometry), None)
     if solid is None:
-        return "a shape without geometry"
+        return "no geometry"
     if solid.tag == "mesh":
         return None
     if solid.tag not in SIZES:
-        return f"a {solid.tag}, unknown to MuJoCo"
+        return f"{solid.tag}: unknown to MuJoCo"
     sizes = [solid.get(name, "") for name in SIZES[solid.tag]]
     values = [float(value) for text in sizes for value in text.split()]
     if all(sizes) and all(0.0 < value < math.inf for value in values):
         return None
-    return f"a {solid.tag} of {' and '.join(f'{n} {s!r}' for n, s in zip(SIZES[solid.tag], sizes, strict=True))}"
+    return f"{solid.tag} of {', '.join(f'{n} {s!r}' for n, s in zip(SIZES[solid.tag], sizes, strict=True))}"
 
 
-def shape_faults(root: ElementTree.Element, path: Path) -> tuple[list[str], list[str]]:
-    """File names in a URDF of meshes that cannot be read, and a sentence on each shape to be left out."""
+def shape_faults(root: ElementTree.Element, path: Path) -> tuple[list[str], dict[str, list[str]]]:
+    """File names in a URDF of meshes that cannot be read, and links and meshes of shapes to be left out, by reason."""
     files = mesh_files(root, path)
-    dropped, sentences = [], []
+    dropped: list[str] = []
+    faults: dict[str, list[str]] = {}
     for link, shape in _shapes(root):
-        mesh, fault = shape.find("geometry/mesh"), shape_fault(shape)
+        mesh, fault, where = shape.find("geometry/mesh"), shape_fault(shape), link.get("name", "")
         if mesh is not None:
             name = mesh.get("filename", "")
             fault = _mesh_fault(files[name], [float(part) for part in mesh.get("scale", "1 1 1").split()])
-            fault = fault and f"{name} {fault}".replace(" :", ":")
+            where = f"{where}: {name}"
             dropped += [name] if fault else []
         if fault:
-            sentences.append(f"{link.get('name', '')}: {fault}")
-    return list(dict.fromkeys(dropped)), list(dict.fromkeys(sentences))
+            faults.setdefault(fault, []).append(where)
+    return list(dict.fromkeys(dropped)), {fault: list(dict.fromkeys(places)) for fault, places in faults.items()}
 
 
 def _mesh_fault(file: Path | None, scale: list[float]) -> str | None:
     """MuJoCo's reason against a mesh, or that of its reader; None for a good one."""
     if file is None:
-        return "is not found"
+        return "not found"
     spec = mujoco.MjSpec()
     try:
         mesh = spec.add_mesh(name="mesh", file=str(file.absolute()), scale=scale)
@@ -177,12 +178,10 @@ def _mesh_fault(file: Path | None, scale: list[float]) -> str | None:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
         spec.compile()
     except ValueError as error:
-        text = str(error).removeprefix(str(file)).split("\nElement")[0].removeprefix("Error: ")
+        text = str(error).removeprefix(str(file)).split("\nElement")[0].removeprefix("Error: ").strip(": ")
         if "coplanar" in text:
-            return "is flat"
-        if "too small" in text:
-            return "is too small: perhaps it is scaled twice"
-        return " ".join(text.split())
+            return "flat"
+        return "without volume: open, or scaled twice" if "too small" in text else " ".join(text.split())
     return None
 
 
@@ -259,7 +258,7 @@ def _ignored_limits(root: ElementTree.Element) -> dict[str, tuple[float, float]]
     ignored = {}
     for joint in root.findall("joint"):
         limit = joint.find("limit")
-        if limit is None or joint.get("type") == "continuous":
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
             continue
         lower, upper = (float(limit.get(name, 0.0)) for name in ("lower", "upper"))
         endless = math.isinf(lower) or math.isinf(upper)

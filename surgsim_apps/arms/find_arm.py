@@ -173,7 +173,9 @@ class _Finder:
             self.chosen.append(f"limits whose lower is above the upper one are used in order: {_listed(pairs)}")
         if survey.locked:
             values = [f"{name} at {value:g}" for name, value in survey.locked.items()]
-            self.chosen.append(f"joints with equal limits, and those coupled to them, are held there: {_listed(values)}")
+            self.chosen.append(
+                f"joints with equal limits, and those coupled to them, are held there: {_listed(values)}"
+            )
         if survey.inertias:
             self.chosen.append(
                 "links without a valid inertia get that of a block around their shapes: "

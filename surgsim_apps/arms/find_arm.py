@@ -173,9 +173,7 @@ class _Finder:
             self.chosen.append(f"limits whose lower is above the upper one are used in order: {_listed(pairs)}")
         if survey.locked:
             values = [f"{name} at {value:g}" for name, value in survey.locked.items()]
-            self.chosen.append(
-                f"joints with equal limits, and those coupled to them, are held there: {_listed(values)}"
-            )
+            self.chosen.append(f"joints with equal limits, and those coupled to them, are held: {_listed(values)}")
         if survey.inertias:
             self.chosen.append(
                 "links without a valid inertia get that of a block around their shapes: "
@@ -413,7 +411,8 @@ class _Finder:
             what = "the trocar" if self.trocar_given is None else f"the trocar at {vector(self.trocar_given, 4)}"
             raise ValueError(
                 f"model file {self.survey.path}: no pose was found with the shaft in {what}, the tip "
-                f"{1e3 * HOME_DEPTH:.0f} mm past it and the tool outside other links: move it with --trocar, or name another --tip"
+                f"{1e3 * HOME_DEPTH:.0f} mm past it and the tool outside other links: move it with --trocar, or name "
+                "another --tip"
             )
         return best
 

@@ -1,6 +1,7 @@
 """Survey of a model file: joints of its tip, outer shapes, straight shaft, remote centre."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -85,6 +86,7 @@ class ModelSurvey:
         speed_limits: of a URDF [rad/s or m/s]
         locked: values of joints with equal limits, and of those coupled to them [rad or m]; taken out of the model
         crossed: limits of joints in whose file the lower is above the upper one, in order [rad or m]
+        angle_unit: of the file's hinges [rad]
         model, data: of MuJoCo, at the model's initial joint values
     """
 
@@ -123,6 +125,7 @@ class ModelSurvey:
         try:
             with warned(f"arm {self.path.stem!r}"):
                 spec = read_model(self.path, inertias, self.dropped_meshes)
+                self.angle_unit = math.radians(1.0) if spec.compiler.degree else 1.0
                 hold_joints(spec, self.locked)
                 self.model = spec.compile()
         except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
@@ -130,15 +133,20 @@ class ModelSurvey:
         self.data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, self.data)
 
+    def _ignored_limits(self) -> Iterator[tuple[int, float, float]]:
+        """Joints whose limits MuJoCo ignores, and these [rad or m]; it leaves them in the file's unit."""
+        for joint in np.flatnonzero(self.model.jnt_limited == 0):
+            unit = self.angle_unit if self.model.jnt_type[joint] == HINGE else 1.0
+            lower, upper = unit * self.model.jnt_range[joint]
+            yield int(joint), float(lower), float(upper)
+
     def _crossed(self) -> dict[str, tuple[float, float]]:
-        ranges = {self.model.joint(j).name: self.model.jnt_range[j] for j in range(self.model.njnt)}
-        return {name: (float(upper), float(lower)) for name, (lower, upper) in ranges.items() if lower > upper}
+        return {self.model.joint(joint).name: (high, low) for joint, low, high in self._ignored_limits() if low > high}
 
     def _locked(self) -> dict[str, float]:
         """Joints with equal limits, of which 0 and 0 state none, and those that follow them."""
         model = self.model
-        low, high = model.jnt_range.T
-        values = {int(joint): float(low[joint]) for joint in np.flatnonzero((low == high) & (low != 0.0))}
+        values = {joint: low for joint, low, high in self._ignored_limits() if low == high != 0.0}
         for _ in range(model.neq):
             for index in np.flatnonzero(model.eq_type == COUPLING):
                 follower, master = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
@@ -235,7 +243,13 @@ class ModelSurvey:
         last = int(model.jnt_bodyid[min(ends)])
         if len(ends) > 1:
             paths = [self.parents(int(model.jnt_bodyid[joint])) for joint in sorted(ends)]
-            last = next(body for body in paths[0] if all(body in path for path in paths))
+            last = next((body for body in paths[0] if all(body in path for path in paths)), 0)
+            if not self._joints_to(last):
+                names = ", ".join(self.body_name(path[0]) for path in paths)
+                raise ValueError(
+                    f"model file {self.path} ends in {len(paths)} chains of {max(counts)} joints: name the tip of one, "
+                    f"--tip {names}"
+                )
         fixed = [body for body in range(1, model.nbody) if self._fixed_to(body, last)]
         marks = [index for index in range(model.nsite) if int(model.site_bodyid[index]) in fixed]
         marks = [index for index in marks if _has_tip_word(model.site(index).name)]

@@ -6,7 +6,6 @@ from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
-import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -279,8 +278,8 @@ def test_limits_of_zero_or_infinity_are_none(tmp_path, limit):
 def test_limits_of_mjcf_joints_are_read_likewise(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(
-        '<mujoco><worldbody><body><joint name="a" range="60 -60"/><geom size="0.1"/><body><joint name="b" range="30 30"/>'
-        '<geom size="0.1"/></body></body></worldbody></mujoco>'
+        '<mujoco><worldbody><body><joint name="a" range="60 -60"/><geom size="0.1"/><body>'
+        '<joint name="b" range="30 30"/><geom size="0.1"/></body></body></worldbody></mujoco>'
     )
     survey = ModelSurvey(path)
     assert survey.crossed.keys() == {"a"}
@@ -305,6 +304,14 @@ def test_a_tool_may_touch_the_hand_and_the_links_at_its_flange(tmp_path):
     found = find_arm(path, tip="tool0")
     assert found.reach > 0.5
     assert found.description.held == {"grip": 0.0}
+
+
+def test_two_arms_ask_for_the_tip_of_one(tmp_path):
+    path = tmp_path / "arm.xml"
+    arm = '<body name="{0}"><joint/><geom size="0.1"/></body>'
+    path.write_text(f"<mujoco><worldbody>{arm.format('left')}{arm.format('right')}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match="left, right"):
+        find_arm(path)
 
 
 # ---- robot_descriptions ------------------------------------------------------------------------------------------

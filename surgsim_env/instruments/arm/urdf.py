@@ -134,13 +134,14 @@ def _shapes(root: ElementTree.Element) -> list[tuple[ElementTree.Element, Elemen
 
 
 def shape_fault(shape: ElementTree.Element) -> str | None:
-    """Reason for leaving out a visual or collision element that is no mesh; None for a shape with an extent."""
+    """Reason for leaving out a visual or collision element, whatever its mesh; None for a shape with an extent."""
     geometry = shape.find("geometry")
     solid = None if geometry is None else next(iter(geometry), None)
     if solid is None:
         return "no geometry"
     if solid.tag == "mesh":
-        return None
+        scale = solid.get("scale", "1 1 1")
+        return None if all(map(float, scale.split())) else f"scale {scale!r}"
     if solid.tag not in SIZES:
         return f"{solid.tag}: unknown to MuJoCo"
     sizes = [solid.get(name, "") for name in SIZES[solid.tag]]
@@ -159,9 +160,10 @@ def shape_faults(root: ElementTree.Element, path: Path) -> tuple[list[str], dict
         mesh, fault, where = shape.find("geometry/mesh"), shape_fault(shape), link.get("name", "")
         if mesh is not None:
             name = mesh.get("filename", "")
-            fault = _mesh_fault(files[name], [float(part) for part in mesh.get("scale", "1 1 1").split()])
             where = f"{where}: {name}"
-            dropped += [name] if fault else []
+            if not fault:
+                fault = _mesh_fault(files[name], [float(part) for part in mesh.get("scale", "1 1 1").split()])
+                dropped += [name] if fault else []
         if fault:
             faults.setdefault(fault, []).append(where)
     return list(dict.fromkeys(dropped)), {fault: list(dict.fromkeys(places)) for fault, places in faults.items()}
@@ -230,7 +232,8 @@ def find_mesh(path: Path, name: str, folder: str = "", strip: bool = True) -> Pa
     Args:
         path: of the URDF.
         name: such as meshes/link.stl, /home/them/link.stl or package://arm/meshes/link.stl.
-        folder, strip: of the meshes by the URDF's compiler element, and whether it strips folders from their names.
+        folder: of the meshes by the URDF's compiler element.
+        strip: True if that element takes folders off their names, as by default.
     """
     return next((place for place in _places(path, name, folder, strip) if place.is_file()), None)
 

@@ -167,7 +167,7 @@ def _public_model(name: str, console: Console) -> Path:
     if pulled.returncode != 0:
         # The exception at the end of a traceback, without progress bars.
         ended = re.split(r"^(?=[\w.]+Error)", pulled.stderr, flags=re.MULTILINE)[-1]
-        reason = " ".join(line for line in ended.splitlines() if "%|" not in line)
+        reason = " ".join(line for line in ended.splitlines() if "it/s" not in line)
         raise ValueError(f"robot_descriptions could not give {name}: {reason}")
     return Path(pulled.stdout.splitlines()[-1])
 

@@ -32,20 +32,10 @@ SIZES = {
     "sphere": ("radius",),
 }
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-# Attributes that are numbers, with their count where it is not 1.
-NUMBERS = {
-    **SIZES,
-    "inertia": MOMENTS,
-    "mass": ("value",),
-    "origin": ("xyz", "rpy"),
-    "axis": ("xyz",),
-    "limit": ("lower", "upper", "effort", "velocity"),
-    "mimic": ("multiplier", "offset"),
-    "dynamics": ("damping", "friction"),
-    "mesh": ("scale",),
-    "color": ("rgba",),
-}
-COUNTS = {"xyz": 3, "rpy": 3, "size": 3, "scale": 3, "rgba": 4}
+# Attributes of links and joints that are numbers, with their count.
+NUMBERS = {"xyz": 3, "rpy": 3, "size": 3, "scale": 3, "rgba": 4}
+NUMBERS |= dict.fromkeys(("radius", "length", "value", "multiplier", "offset", "damping", "friction", *MOMENTS), 1)
+NUMBERS |= dict.fromkeys(("lower", "upper", "effort", "velocity"), 1)
 # Elements whose numbers may be infinite or nan: their shapes are left out, their inertias replaced.
 REPLACED = ("inertia", "mass", *SIZES)
 
@@ -64,8 +54,8 @@ def check_numbers(root: ElementTree.Element, path: Path) -> None:
                 where = f"model file {path}: {part.tag} {part.get('name', '')}: {element.tag} {name} is {text!r}"
                 if "${" in text or "$(" in text:
                     raise ValueError(f"{where}: run xacro first")
-                count = COUNTS.get(name, 1)
-                if name in NUMBERS.get(element.tag, ()) and not _are_numbers(text, count, element.tag):
+                count = NUMBERS.get(name) if name != "value" or element.tag == "mass" else None
+                if count and not _are_numbers(text, count, element.tag):
                     raise ValueError(f"{where}; write {count} number{'s with blanks between them' * (count > 1)}")
 
 

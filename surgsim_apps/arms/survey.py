@@ -8,10 +8,19 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
+from msdm_core.arithmetic import cbrt, cos, dot, eigh, lstsq, matmul, norm, sin, solve, svd
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
-from surgsim_env.instruments import MESH_FORMATS, find_mesh, mesh_names, read_model, read_xml
+from surgsim_env.instruments import (
+    MESH_FORMATS,
+    coupled_values,
+    find_mesh,
+    leaders_of,
+    mesh_names,
+    narrowed_limits,
+    read_model,
+    read_xml,
+)
 from surgsim_env.scene import LinkInertia, Vector, nearest
 
 # Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.
@@ -24,6 +33,9 @@ THICKNESS_LEAST = 0.002
 SHAFT_LENGTH_LEAST, SHAFT_RADIUS_MOST = 0.10, 0.008
 # Largest distance of axes from their meeting point [m].
 MEETING_TOLERANCE = 1e-4
+# A shaft has a remote centre if it passes a point by no more in 2^8 poses [m]: chosen, for the parallelogram of
+# jhu-dvrk/dvrk_model's da Vinci Si, which leaves it by 4 mm.
+CENTRE_TOLERANCE, POSES_POWER = 5e-3, 8
 # Words in the names of frames at a tool's tip.
 TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
 # As numbers: a numpy integer equals no member of MuJoCo's enumerations.
@@ -62,6 +74,9 @@ class RemoteCentre:
         body: of the shaft
         shaft_point, shaft_axis: in that body's frame [m], the axis towards the tip (3,)
         joint: the slide for inserting the shaft
+        turning: driven joints that turn the shaft about the point
+        depths: least and largest depth of the tip past the point, its wrist straight [m]  (2,)
+        missed: largest distance of the shaft's axis from the point [m]
     """
 
     point: FloatArray
@@ -69,6 +84,9 @@ class RemoteCentre:
     shaft_point: FloatArray
     shaft_axis: FloatArray
     joint: int
+    turning: frozenset[int]
+    depths: tuple[float, float]
+    missed: float
 
 
 class ModelSurvey:
@@ -159,11 +177,32 @@ class ModelSurvey:
             raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
         return joints
 
+    def driven(self, joints: Sequence[int]) -> list[int]:
+        """The joints of a chain that no other one leads, in its order: leaders before their followers.
+
+        Raises:
+            ValueError: couplings that contradict each other.
+        """
+        driven: list[int] = []
+        for joint in sorted(joints, key=lambda joint: len(leaders_of(self.model, joint))):
+            if joint not in coupled_values(self.model, driven):
+                driven.append(joint)
+        return sorted(driven, key=joints.index)
+
+    def connecting(self, joints: Sequence[int]) -> set[int]:
+        """Joints beside a chain that two of its joints follow: they move with the chain."""
+        trails: dict[int, list[list[int]]] = {}
+        for joint in joints:
+            trail = leaders_of(self.model, joint)
+            trails.setdefault(trail[-1], []).append(trail)
+        shared = [trail for group in trails.values() if len(group) > 1 for trail in group]
+        return {joint for trail in shared for joint in trail}.difference(joints)
+
     def find_tip(self, named: str | None) -> tuple[int, FloatArray | None]:
         """The body of the tip, and the tip's offset in that body [m] (3,) if a frame marks it.
 
-        Without a name it is a frame fixed to the last link of the longest chain of joints, or that link; of a chain
-        that ends in several fingers, their common link.
+        Without a name it is a frame fixed to the last link of the longest chain of driven joints (of equal ones the one
+        with more followers), or that link; of a chain that ends in several fingers, their common link.
 
         Raises:
             ValueError: a name of neither a body nor a site.
@@ -178,15 +217,16 @@ class ModelSurvey:
                 return self._at_site(sites[named])
             known = sorted(name for name in (*bodies, *sites) if name)
             raise ValueError(f"--tip: {self.path.name} has no link or site {named!r}{nearest(named, known)}")
-        counts = [len(self._joints_to(body)) for body in range(model.nbody)]
+        paths = [self._joints_to(body) for body in range(model.nbody)]
+        counts = [(len(self.driven(path)), len(path)) for path in paths]
         deepest = [body for body in range(model.nbody) if counts[body] == max(counts)]
-        if max(counts) == 0:
+        if max(counts) == (0, 0):
             raise ValueError(f"model file {self.path} has no joint: name the model of an arm")
         ends = {self._joints_to(body)[-1] for body in deepest}
         last = int(model.jnt_bodyid[min(ends)])
         if len(ends) > 1:
-            paths = [self.parents(int(model.jnt_bodyid[joint])) for joint in sorted(ends)]
-            last = next(body for body in paths[0] if all(body in path for path in paths))
+            carriers = [self.parents(int(model.jnt_bodyid[joint])) for joint in sorted(ends)]
+            last = next(body for body in carriers[0] if all(body in part for part in carriers))
         fixed = [body for body in range(1, model.nbody) if self._fixed_to(body, last)]
         marks = [index for index in range(model.nsite) if int(model.site_bodyid[index]) in fixed]
         marks = [index for index in marks if _has_tip_word(model.site(index).name)]
@@ -215,9 +255,11 @@ class ModelSurvey:
         return False
 
     def place(self, joints: Sequence[int], values: FloatArray) -> None:
-        """Compute the kinematics at values of some joints [rad or m], the others as the model has them."""
+        """Compute the kinematics at values of some joints [rad or m], the others as couplings or the model have them."""
         self.data.qpos[:] = self.model.qpos0
-        self.data.qpos[self.model.jnt_qposadr[list(joints)]] = values
+        fixed = dict(zip(joints, values.tolist(), strict=True))
+        for joint, value in coupled_values(self.model, (), fixed).items():
+            self.data.qpos[self.model.jnt_qposadr[joint]] = value.offset
         mujoco.mj_kinematics(self.model, self.data)
 
     def range_of(self, joint: int, unlimited: float) -> tuple[float, float]:
@@ -273,50 +315,69 @@ class ModelSurvey:
     # ---- remote centre ---------------------------------------------------------------------------------------
 
     def remote_centre(self, chain: Sequence[int], tip: int, offset: FloatArray) -> RemoteCentre | None:
-        """The common point of the first hinges' axes in all poses, on the line of the shaft's slide."""
+        """The point that the line of a shaft's slide passes in all poses, within CENTRE_TOLERANCE.
+
+        In the frame of the shaft's link (position x, rotation R) the line passes through c along a. The point p and c
+        are the least-squares solution of (I - R a a^T R^T) (p - x - R c) = 0 over 2^POSES_POWER poses; they are a single one
+        if at least two driven joints turn the shaft.
+        """
+        from scipy.stats.qmc import Sobol
+
         model = self.model
         slides = [index for index, joint in enumerate(chain) if model.jnt_type[joint] == SLIDE]
-        if not slides or slides[0] < 2 or not model.jnt_limited[chain[slides[0]]]:
+        if not slides:
             return None
-        before, slide = chain[: slides[0]], chain[slides[0]]
-        body = int(model.jnt_bodyid[slide])
-        rng, poses = np.random.default_rng(0), []
-        for _ in range(3):
-            ranges = np.array([self.range_of(joint, np.pi) for joint in chain])
-            self.place(chain, ranges[:, 0] + rng.random(len(chain)) * np.ptp(ranges, axis=1))
-            point = meeting_point(self.data.xanchor[before], self.data.xaxis[before])
-            if point is None:
-                return None
-            body = self._shaft_body(chain, slides[0])
-            rotation = self.data.xmat[body].reshape(3, 3)
-            axis = matmul(rotation.T, self.data.xaxis[slide])
-            # The line's point nearest to the body's origin; the insertion does not move it.
-            local = matmul(rotation.T, point - self.data.xpos[body])
-            poses.append((point, local - matmul(local, axis) * axis, axis))
-        first = poses[0]
-        if any(np.abs(np.array(pose) - np.array(first)).max() > MEETING_TOLERANCE for pose in poses):
+        driven, slide = self.driven(chain), chain[slides[0]]
+        values = coupled_values(model, driven)
+        limits = narrowed_limits(model, driven, np.array([self.range_of(joint, np.inf) for joint in driven]))
+        inserting = values[slide].driver
+        if values[slide].slope == 0.0 or not np.isfinite(limits[driven.index(inserting)]).all():
             return None
-        point, local, axis = first
-        low, high = self.range_of(slide, 0.0)
-        reach = []
-        for value in (low, high):
-            self.place([slide], np.array([value]))
+        turning = {values[joint].driver for joint in chain[: slides[0]] if values[joint].slope != 0.0} - {inserting}
+        lower, upper = np.where(np.isfinite(limits), limits, [-np.pi, np.pi]).T
+        self.place(driven, 0.5 * (lower + upper))
+        body = self._shaft_body(chain, slides[0])
+        shares = Sobol(len(driven), scramble=False).random_base2(POSES_POWER)
+        rows, right = np.zeros((len(shares), 3, 6)), np.zeros((len(shares), 3))
+        for pose, share in enumerate(shares):
+            self.place(driven, lower + share * (upper - lower))
+            axis = self.data.xaxis[slide]
+            across = np.eye(3) - axis[:, None] * axis
+            rows[pose] = np.hstack([across, -matmul(across, self.data.xmat[body].reshape(3, 3))])
+            right[pose] = matmul(across, self.data.xpos[body])
+        sizes = svd(rows.reshape(-1, 6))[1]
+        # c is free along a; another free direction is that of an axis about which alone the shaft turns.
+        if sizes[-2] < 1e-2:
+            return None
+        solution = lstsq(rows.reshape(-1, 6), right.ravel())
+        missed = float(norm(matmul(rows, solution) - right, axis=1).max())
+        if missed > CENTRE_TOLERANCE:
+            return None
+        point, on_line = np.split(solution, 2)
+        axis, reach = matmul(self.data.xmat[body].reshape(3, 3).T, self.data.xaxis[slide]), []
+        for value in limits[driven.index(inserting)]:
+            joints = dict(zip(driven, model.qpos0[model.jnt_qposadr[driven]], strict=True)) | {inserting: value}
+            self.place(driven, np.array(list(joints.values())))
             along = matmul(self.data.xmat[body].reshape(3, 3), axis)
             tip_now = self.data.xpos[tip] + matmul(self.data.xmat[tip].reshape(3, 3), offset)
             reach.append(float(matmul(tip_now - point, along)))
-        sign = np.sign(max(reach, key=abs))
-        return RemoteCentre(point, body, local, sign * axis, slide)
+        sign = float(np.sign(max(reach, key=abs)))
+        least, most = sorted(sign * value for value in reach)
+        shaft_point = on_line - matmul(on_line, axis) * axis
+        return RemoteCentre(point, body, shaft_point, sign * axis, slide, frozenset(turning), (least, most), missed)
 
     def _shaft_body(self, chain: Sequence[int], slide: int) -> int:
-        """The last body with no motion but turning about the line of a slide, in the current pose."""
+        """The last body with no motion but along the line of a slide and about it, in the current pose."""
         body = int(self.model.jnt_bodyid[chain[slide]])
         axis = self.data.xaxis[chain[slide]]
-        line = self.data.xanchor[chain[slide + 1]] if slide + 1 < len(chain) else None
+        line = None
         for joint in chain[slide + 1 :]:
-            turned = norm(np.cross(self.data.xaxis[joint], axis))
-            aside = norm(np.cross(self.data.xanchor[joint] - line, axis))
-            if self.model.jnt_type[joint] != HINGE or turned > 1e-6 or aside > MEETING_TOLERANCE:
+            if norm(np.cross(self.data.xaxis[joint], axis)) > 1e-6:
                 break
+            if self.model.jnt_type[joint] == HINGE:
+                line = self.data.xanchor[joint] if line is None else line
+                if norm(np.cross(self.data.xanchor[joint] - line, axis)) > MEETING_TOLERANCE:
+                    break
             body = int(self.model.jnt_bodyid[joint])
         return body
 

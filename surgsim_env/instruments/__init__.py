@@ -8,6 +8,7 @@ from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.instruments.arm.steering import SteeredArm
 from surgsim_env.instruments.arm.urdf import MESH_FORMATS, find_mesh, mesh_names
 from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.joint_couplings import coupled_values, leaders_of, narrowed_limits
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
 __all__ = [
@@ -23,9 +24,12 @@ __all__ = [
     "ToolBodies",
     "check_port_outside",
     "compile_arm",
+    "coupled_values",
     "find_mesh",
+    "leaders_of",
     "load_arm",
     "mesh_names",
+    "narrowed_limits",
     "parked_place",
     "position_actuator",
     "read_model",

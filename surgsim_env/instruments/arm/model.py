@@ -14,6 +14,7 @@ import numpy as np
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.urdf import prepare_urdf
+from surgsim_env.instruments.joint_couplings import coupled_values, joint_couplings, narrowed_limits
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
@@ -22,6 +23,10 @@ from surgsim_env.scene.model import Port, frame_into
 # Groups of geoms: visual only, and outer links for clearances; geoms of CONTACT_GROUP touch tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
+# Couplings of joints are as rigid as MuJoCo can make them: within two steps, and by all but 1e-4 of their force.
+COUPLING_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+# Joints of a URDF that may follow others and be followed.
+URDF_JOINTS = ("revolute", "continuous", "prismatic")
 # Largest size of a model file [bytes]: chosen, MuJoCo would read a larger one for minutes.
 FILE_SIZE_MOST = 200_000_000
 # Colour of a description's added shapes.
@@ -49,6 +54,7 @@ def compile_arm(
             spec = arm_spec(description, port, tip_radius, timestep)
             add_supports(spec, supports, moving=supports_move)
             model = spec.compile()
+            _check_couplings(model, description)
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
     _check_joints(model, description, where)
@@ -92,6 +98,7 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
     """
     root = read_xml(path)
     if root.tag == "robot":
+        _check_leaders(root)
         prepare_urdf(root, path, inertias, dropped_meshes)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         spec.modelfiledir = str(path.parent)
@@ -118,6 +125,19 @@ def read_xml(path: Path) -> ElementTree.Element:
         raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
     except ElementTree.ParseError as error:
         raise ValueError(f"model file {path} is not valid XML: {error}") from None
+
+
+def _check_leaders(root: ElementTree.Element) -> None:
+    """Check that the joints of a URDF follow joints that move: MuJoCo leaves out other couplings."""
+    moving = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") in URDF_JOINTS}
+    for joint in root.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None and joint.get("name") in moving and mimic.get("joint") not in moving:
+            leader = mimic.get("joint", "")
+            raise ValueError(
+                f"joint {joint.get('name')!r} follows {leader!r} by <mimic>, which is no joint that moves"
+                f"{nearest(leader, sorted(moving))}: name one there, or take the <mimic> out"
+            )
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
@@ -185,6 +205,15 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         if joint is not None:  # None for a held joint
             joint.range = np.array(limits) / _angle_unit(spec, joint)
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+    coupled: set[str] = set()
+    for equality in spec.equalities:
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT:
+            equality.solref, equality.solimp = (2.0 * timestep, 1.0), COUPLING_SOLIMP
+            coupled |= {equality.name1, equality.name2}
+    # What follows a driven joint has no drive of its own.
+    for actuator in list(spec.actuators):
+        if actuator.target in coupled.difference(arm.joints, arm.jaw):
+            spec.delete(actuator)
     if arm.control.mode == "servo":
         _add_servos(spec, arm)
     _place(spec, arm, port)
@@ -290,6 +319,25 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
     frame = world.add_frame(pos=np.array(port.point) - matmul(rotation, np.array(trocar.point)), quat=quaternion)
     for part in rooted:
         part.set_frame(frame)
+
+
+def _check_couplings(model: mujoco.MjModel, arm: ArmDescription) -> None:
+    """Check that joints follow driven ones by offset and multiplier, and narrow the driven joints' limits for them."""
+    driven = [model.joint(name).id for name in arm.joints]
+    moving = {joint for joint, value in coupled_values(model, driven).items() if value.slope != 0.0}
+    for coupling in joint_couplings(model):
+        if not coupling.linear and moving & {coupling.follower, coupling.leader}:
+            names = [model.joint(joint).name for joint in (coupling.follower, coupling.leader)]
+            raise ValueError(
+                f"joint {names[0]!r} follows {names[1]!r} by a polynomial {coupling.coefficients.tolist()}; a joint of "
+                "an arm follows by its first two numbers: set the others to 0, or hold one of the joints (held)"
+            )
+    limited = model.jnt_limited[driven].astype(bool)
+    own = np.where(limited[:, None], model.jnt_range[driven], [-np.inf, np.inf])
+    narrow = narrowed_limits(model, driven, own)
+    bounded = np.isfinite(narrow).all(axis=1)
+    model.jnt_range[np.array(driven)[bounded]] = narrow[bounded]
+    model.jnt_limited[np.array(driven)[bounded]] = 1
 
 
 def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:

@@ -70,6 +70,9 @@ class SteeredArm:
         self.lower, self.upper = instrument.lower, instrument.upper
         self._instrument, self._places, self._control_step = instrument, places, control_step
         self._qpos = np.array([int(model.joint(prefix + name).qposadr[0]) for name in arm.joints])
+        followers = [arm.model.joint(int(joint)).name for joint in arm.followers.joints]
+        self._follower_qpos = np.array([int(model.joint(prefix + name).qposadr[0]) for name in followers], dtype=int)
+        instrument.servo.lower[places], instrument.servo.upper[places] = arm.lower, arm.upper
         self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
         self._velocity = np.zeros(6)
         self._starts = [direction / norm(direction)]
@@ -132,6 +135,7 @@ class SteeredArm:
         self.short = False
         data, servo = self._instrument.data, self._instrument.servo
         data.qpos[self._qpos] = solution.joints
+        data.qpos[self._follower_qpos] = self.arm.followers.values(solution.joints)
         data.ctrl[servo.position[self._places]] = solution.joints
         servo.command[self._places] = 0.0
         if self.jaw is not None:

@@ -509,10 +509,11 @@ class _Finder:
         slides = self.model.jnt_type[self.chain] == SLIDE
         default = np.where(slides, SLIDE_SPEED, TURN_SPEED)
         speed = dict(zip(self.chain, (stated.get(n, float(s)) for n, s in zip(self.names, default, strict=True))))
-        for joint, value in coupled_values(self.model, self.chain).items():
-            name = self.model.joint(joint).name
-            if joint not in speed and value.slope != 0.0 and name in stated:
-                speed[value.driver] = min(speed[value.driver], stated[name] / abs(value.slope))
+        values = coupled_values(self.model, self.chain)
+        for joint in self.moved:
+            value, most = values[joint], stated.get(self.model.joint(joint).name, math.inf)
+            if value.slope != 0.0:
+                speed[value.driver] = min(speed[value.driver], most / abs(value.slope))
         return tuple(speed[joint] for joint in self.chain)
 
     def _control(self, arm: Arm, home: FloatArray) -> JointControl:

@@ -30,9 +30,9 @@ from surgsim_env.instruments import (
     Arm,
     PoseSolution,
     compile_arm,
-    coupled_values,
-    leaders_of,
-    narrowed_limits,
+    coupled_value,
+    couplings_to_root,
+    joint_value,
     position_actuator,
     solve_pose,
 )
@@ -130,16 +130,16 @@ class _Finder:
         self.survey, self.model = survey, survey.model
         self.notes, self.chosen = [], []
         body, offset = survey.find_tip(tip)
-        self.moved = survey.chain(body)
-        self.chain = survey.driven(self.moved)
-        self.names = [self.model.joint(joint).name for joint in self.chain]
+        self.chain = survey.chain(body)
+        self.moved, self.driven, self.followers = self.chain.joints, self.chain.driven, self.chain.followers
+        self.names = [self.model.joint(joint).name for joint in self.driven]
         limits = self._limits()
         self.lower, self.upper = np.array(limits).T
         self.zero = np.clip(0.0, self.lower, self.upper)
         self._say_model(body)
         centre = None
         if tool_length is None:
-            centre = survey.remote_centre(self.moved, body, np.zeros(3) if offset is None else offset)
+            centre = survey.remote_centre(self.chain, body, np.zeros(3) if offset is None else offset)
         self.centre = centre
         self.depth = HOME_DEPTH
         if centre is not None:
@@ -162,14 +162,18 @@ class _Finder:
     # ---- findings in the file --------------------------------------------------------------------------------
 
     def _limits(self) -> list[tuple[float, float]]:
-        own = np.array([self.survey.range_of(joint, math.inf) for joint in self.chain])
-        narrow = narrowed_limits(self.model, self.chain, own)
-        most = np.where(self.model.jnt_type[self.chain] == SLIDE, SLIDE_RANGE, TURN_RANGE)
-        limits = np.where(np.isfinite(narrow), narrow, np.stack([-most, most], axis=1))
-        bounds = [(round(low, 9), round(high, 9)) for low, high in limits.tolist()]
+        stated = self.chain.limits
+        slides = self.model.jnt_type[self.driven] == SLIDE
+        most = np.where(slides, SLIDE_RANGE, TURN_RANGE)
+        limits = np.where(np.isfinite(stated), stated, np.stack([-most, most], axis=1))
+        pairs = zip(self.names, limits.round(9).tolist(), strict=True)
+        own = np.array([self.survey.range_of(joint, math.inf) for joint in self.driven])
         changed = (limits != own).any(axis=1)
-        self.given_limits = {n: pair for n, pair, new in zip(self.names, bounds, changed, strict=True) if new}
-        free = [name for name, finite in zip(self.names, np.isfinite(narrow).all(axis=1), strict=True) if not finite]
+        self.given_limits = {name: (low, high) for new, (name, (low, high)) in zip(changed, pairs, strict=True) if new}
+        free = [name for name, pair in zip(self.names, stated, strict=True) if not np.isfinite(pair).all()]
+        narrowed = [name for name in self.given_limits if name not in free]
+        if narrowed:
+            self.chosen.append(f"limits are narrowed to those of coupled joints: {', '.join(narrowed)}")
         if free:
             self.chosen.append(
                 f"joints without limits ({', '.join(free)}) get one turn to either side, or -0.5 to 0.5 m"
@@ -178,12 +182,12 @@ class _Finder:
 
     def _say_model(self, body: int) -> None:
         survey = self.survey
-        self.notes.append(f"chain of {len(self.chain)} joints: {', '.join(self.names)}")
-        values = coupled_values(self.model, self.chain)
-        for driver, name in zip(self.chain, self.names, strict=True):
-            led = [j for j in self.moved if j != driver and values[j].driver == driver and values[j].slope != 0.0]
-            if led:
-                self.notes.append(f"coupled to {name}: {', '.join(self.model.joint(joint).name for joint in led)}")
+        self.notes.append(f"chain of {len(self.driven)} joints: {', '.join(self.names)}")
+        for index, name in enumerate(self.names):
+            led = self.followers.joints[(self.followers.driver == index) & (self.followers.slope != 0.0)]
+            names = [self.model.joint(joint).name for joint in led if joint in self.moved]
+            if names:
+                self.notes.append(f"coupled to {name}: {', '.join(names)}")
         self.notes.append(f"its end: {survey.body_name(body)}")
         if survey.dropped_meshes:
             self.chosen.append(
@@ -229,7 +233,8 @@ class _Finder:
                 f"by the model's lengths the shaft leaves its remote centre by up to {1e3 * centre.missed:.1f} mm"
             )
         along = matmul(self.survey.data.xmat[centre.body].reshape(3, 3), centre.shaft_axis)
-        return self._wristed(centre.body, centre.shaft_point, centre.shaft_axis, along, body, offset, centre.depths[1] - centre.depths[0] + 0.05)
+        length = centre.depths[1] - centre.depths[0] + 0.05
+        return self._wristed(centre.body, centre.shaft_point, centre.shaft_axis, along, body, offset, length)
 
     def _own_shaft(self, carrier: int, body: int, offset: FloatArray | None) -> _Tool:
         """A straight thin part of the model as the shaft."""
@@ -470,16 +475,16 @@ class _Finder:
 
     def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
         """Poses with different joints that turn the shaft about a remote centre."""
-        before = np.isin(self.chain, list(centre.turning))
-        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.chain)))
+        before = np.isin(np.arange(len(self.driven)), list(centre.turning))
+        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.driven)))
         return [np.where(before, pose, self.zero) for pose in (self.zero, 0.5 * (self.lower + self.upper), *draws)]
 
     def _good_starts(self, arm: Arm) -> list[FloatArray]:
         """Poses with the tool pointing down, away from limits and singular poses, the best first; keyframes before."""
-        own = [self.model.key_qpos[key][self.model.jnt_qposadr[self.chain]] for key in range(self.model.nkey)]
+        own = [self.model.key_qpos[key][self.model.jnt_qposadr[self.driven]] for key in range(self.model.nkey)]
         own = [key.clip(self.lower, self.upper) for key in own]
         lower, upper = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
-        draws = np.random.default_rng(0).uniform(lower, upper, (POSES_DRAWN, len(self.chain)))
+        draws = np.random.default_rng(0).uniform(lower, upper, (POSES_DRAWN, len(self.driven)))
         worth = np.array([self._worth(arm, pose) for pose in draws])
         order = np.argsort(-worth)[:POSES_TRIED]
         return [*own, self.zero, *draws[order]]
@@ -506,15 +511,14 @@ class _Finder:
 
     def _speed_limits(self) -> tuple[float, ...]:
         stated = self.survey.speed_limits
-        slides = self.model.jnt_type[self.chain] == SLIDE
+        slides = self.model.jnt_type[self.driven] == SLIDE
         default = np.where(slides, SLIDE_SPEED, TURN_SPEED)
-        speed = dict(zip(self.chain, (stated.get(n, float(s)) for n, s in zip(self.names, default, strict=True))))
-        values = coupled_values(self.model, self.chain)
-        for joint in self.moved:
-            value, most = values[joint], stated.get(self.model.joint(joint).name, math.inf)
-            if value.slope != 0.0:
-                speed[value.driver] = min(speed[value.driver], most / abs(value.slope))
-        return tuple(speed[joint] for joint in self.chain)
+        speed = np.array([stated.get(name, value) for name, value in zip(self.names, default, strict=True)])
+        for joint, driver, slope, _ in zip(*self.followers, strict=True):
+            if slope != 0.0:
+                most = stated.get(self.model.joint(joint).name, math.inf) / abs(slope)
+                speed[driver] = min(speed[driver], most)
+        return tuple(speed.tolist())
 
     def _control(self, arm: Arm, home: FloatArray) -> JointControl:
         """The model's own position actuators, if each joint has a usable one, else servos for these joints."""
@@ -530,17 +534,17 @@ class _Finder:
             )
         else:
             self.chosen.append("the model has no actuators: servos are added")
-        inertia, own = joint_inertia(arm, home), model.dof_armature[model.jnt_dofadr[self.chain]]
+        inertia, own = joint_inertia(arm, home), model.dof_armature[model.jnt_dofadr[self.driven]]
         lever = norm(arm.tip_jacobian(home)[:3], axis=0)
-        slides = model.jnt_type[self.chain] == SLIDE
+        slides = model.jnt_type[self.driven] == SLIDE
         lever = np.where(slides, 1.0, np.maximum(lever, LEVER_LEAST))
         least = TIP_STIFFNESS * (lever * lever) / (NATURAL_FREQUENCY * NATURAL_FREQUENCY)
         armature = np.maximum(own, least - (inertia - own))
         total = inertia - own + armature
         stiffness, damping = total * (NATURAL_FREQUENCY * NATURAL_FREQUENCY), 2.0 * total * NATURAL_FREQUENCY
         effort = TIP_FORCE * lever + total * np.array(speed) / 0.1
-        stated = model.jnt_actfrcrange[self.chain, 1]
-        effort = np.where(model.jnt_actfrclimited[self.chain].astype(bool) & (stated > 0.0), stated, effort)
+        stated = model.jnt_actfrcrange[self.driven, 1]
+        effort = np.where(model.jnt_actfrclimited[self.driven].astype(bool) & (stated > 0.0), stated, effort)
         return JointControl("servo", speed, *(_figures(values) for values in (stiffness, damping, effort, armature)))
 
     def _covers(self, actuator: int, index: int) -> bool:
@@ -550,17 +554,22 @@ class _Finder:
         return bool(least <= self.lower[index] + 1e-9 and most >= self.upper[index] - 1e-9)
 
     def _held(self, home: FloatArray) -> dict[str, float]:
-        """Values of undriven joints: as coupled to driven ones at home or to each other, else 0 or the nearest limit."""
-        model, survey = self.model, self.survey
-        values = coupled_values(model, (), dict(zip(self.chain, home.tolist(), strict=True)))
-        moving = survey.connecting(self.moved).union(self.moved)
-        others = [joint for joint in range(model.njnt) if model.jnt_type[joint] != FREE and joint not in moving]
-        for joint in sorted(others, key=lambda joint: len(leaders_of(model, joint))):
-            if joint not in values:
-                limits = narrowed_limits(model, [joint], np.array([survey.range_of(joint, math.inf)]))
-                fixed = {known: value.offset for known, value in values.items()}
-                values = coupled_values(model, (), {**fixed, joint: float(np.clip(0.0, *limits[0]))})
-        return {model.joint(joint).name: round(values[joint].offset, 9) + 0.0 for joint in others}
+        """Values of undriven joints: as coupled to driven ones at home, or to a root at 0 or the nearest limit."""
+        model, survey, values = self.model, self.survey, {}
+        for joint, value in zip(self.driven, home, strict=True):
+            root, slope, offset = joint_value(model, joint)
+            values[root] = float(value - offset) / slope
+        # Joints that two of the chain follow move with it.
+        roots = [joint_value(model, joint).root for joint in self.moved]
+        shared = [joint for joint, root in zip(self.moved, roots, strict=True) if roots.count(root) > 1]
+        held = {}
+        for joint in sorted(set(range(model.njnt)).difference(self.moved, survey.leaders(shared))):
+            if model.jnt_type[joint] != FREE:
+                couplings = couplings_to_root(model, joint)
+                root = couplings[-1].leader if couplings else joint
+                value = values.get(root, float(np.clip(0.0, *survey.range_of(root, math.inf))))
+                held[model.joint(joint).name] = round(coupled_value(model, couplings, value), 9) + 0.0
+        return held
 
     def _description(
         self,
@@ -626,13 +635,14 @@ class _Finder:
             self.chosen.append(f"trocar at {vector(point, 4)} m of the model's frame; --trocar x,y,z sets another one")
         self.notes.append(
             f"home with the tip {1e3 * self.depth:.0f} mm past the trocar; the tip reaches {reach:.0%} of the places "
-            f"{1e2 * (self.depth + DEPTHS[0]):.0f} to {1e2 * (self.depth + DEPTHS[-1]):.0f} cm past it, up to {math.degrees(TILT):.0f} degrees aside"
+            f"{1e2 * (self.depth + DEPTHS[0]):.0f} to {1e2 * (self.depth + DEPTHS[-1]):.0f} cm past it, up to "
+            f"{math.degrees(TILT):.0f} degrees aside"
         )
         return FoundArm(description, self.notes, self.chosen, reach)
 
 
 def reach_share(arm: Arm, home: FloatArray, into: FloatArray, depth: float) -> float:
-    """Share of places in reach, of those at DEPTHS from a depth past the trocar [m], straight on and tilted by TILT to four sides."""
+    """Share of places in reach, of those at DEPTHS about a depth [m], straight on and tilted by TILT to four sides."""
     sides = np.stack(tangent_axes(into))
     ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for axis in sides for side in (axis, -axis))]
     places = [arm.trocar + (depth + further) * way for way in ways for further in DEPTHS]

@@ -1,6 +1,7 @@
 """Survey of a model file: joints of its tip, outer shapes, straight shaft, remote centre."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +14,11 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
 from surgsim_env.instruments import (
     MESH_FORMATS,
-    coupled_values,
+    Followers,
+    couplings_to_root,
     find_mesh,
-    leaders_of,
+    followers_of,
+    joint_value,
     mesh_names,
     narrowed_limits,
     read_model,
@@ -74,7 +77,7 @@ class RemoteCentre:
         body: of the shaft
         shaft_point, shaft_axis: in that body's frame [m], the axis towards the tip (3,)
         joint: the slide for inserting the shaft
-        turning: driven joints that turn the shaft about the point
+        turning: indices of the driven joints that turn the shaft about the point
         depths: least and largest depth of the tip past the point, its wrist straight [m]  (2,)
         missed: largest distance of the shaft's axis from the point [m]
     """
@@ -87,6 +90,23 @@ class RemoteCentre:
     turning: frozenset[int]
     depths: tuple[float, float]
     missed: float
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Joints that move a tip.
+
+    Fields:
+        joints: from the base to the tip
+        driven: those of them with a drive, n
+        followers: the others, and joints beside the chain that its joints follow
+        limits: of the driven joints, within those of their followers; infinite without any [rad or m]   (n, 2)
+    """
+
+    joints: list[int]
+    driven: list[int]
+    followers: Followers
+    limits: FloatArray
 
 
 class ModelSurvey:
@@ -166,37 +186,42 @@ class ModelSurvey:
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return list(range(first, first + count))
 
-    def chain(self, body: int) -> list[int]:
+    def chain(self, body: int) -> Chain:
         """Joints from the base to a body.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is none, or a coupling that an arm may not have.
         """
         joints = self._joints_to(body)
         if not joints:
             raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
-        return joints
+        driven = self._driven(joints)
+        own = np.array([self.range_of(joint, np.inf) for joint in driven])
+        with self._named():
+            followers = followers_of(self.model, driven, [*joints, *sorted(self.leaders(joints))])
+            return Chain(joints, driven, followers, narrowed_limits(self.model, driven, followers, own))
 
-    def driven(self, joints: Sequence[int]) -> list[int]:
-        """The joints of a chain that no other one leads, in its order: leaders before their followers.
+    def leaders(self, joints: Sequence[int]) -> set[int]:
+        """Joints beside a chain that its joints follow."""
+        couplings = [coupling for joint in joints for coupling in couplings_to_root(self.model, joint)]
+        return {coupling.leader for coupling in couplings}.difference(joints, [-1])
 
-        Raises:
-            ValueError: couplings that contradict each other.
-        """
-        driven: list[int] = []
-        for joint in sorted(joints, key=lambda joint: len(leaders_of(self.model, joint))):
-            if joint not in coupled_values(self.model, driven):
-                driven.append(joint)
-        return sorted(driven, key=joints.index)
+    def _driven(self, joints: Sequence[int]) -> list[int]:
+        """Joints to be driven: of those with one root, the root or else the first."""
+        driven: dict[int, int] = {}
+        with self._named():
+            for joint in joints:
+                root, slope, _ = joint_value(self.model, joint)
+                if slope != 0.0 and (joint == root or root not in driven):
+                    driven[root] = joint
+        return sorted(driven.values(), key=joints.index)
 
-    def connecting(self, joints: Sequence[int]) -> set[int]:
-        """Joints beside a chain that two of its joints follow: they move with the chain."""
-        trails: dict[int, list[list[int]]] = {}
-        for joint in joints:
-            trail = leaders_of(self.model, joint)
-            trails.setdefault(trail[-1], []).append(trail)
-        shared = [trail for group in trails.values() if len(group) > 1 for trail in group]
-        return {joint for trail in shared for joint in trail}.difference(joints)
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"model file {self.path}: {error}") from None
 
     def find_tip(self, named: str | None) -> tuple[int, FloatArray | None]:
         """The body of the tip, and the tip's offset in that body [m] (3,) if a frame marks it.
@@ -218,7 +243,7 @@ class ModelSurvey:
             known = sorted(name for name in (*bodies, *sites) if name)
             raise ValueError(f"--tip: {self.path.name} has no link or site {named!r}{nearest(named, known)}")
         paths = [self._joints_to(body) for body in range(model.nbody)]
-        counts = [(len(self.driven(path)), len(path)) for path in paths]
+        counts = [(len(self._driven(path)), len(path)) for path in paths]
         deepest = [body for body in range(model.nbody) if counts[body] == max(counts)]
         if max(counts) == (0, 0):
             raise ValueError(f"model file {self.path} has no joint: name the model of an arm")
@@ -254,12 +279,12 @@ class ModelSurvey:
                 return False
         return False
 
-    def place(self, joints: Sequence[int], values: FloatArray) -> None:
-        """Compute the kinematics at values of some joints [rad or m], the others as couplings or the model have them."""
+    def place(self, chain: Chain, values: FloatArray) -> None:
+        """Compute the kinematics at values of a chain's driven joints [rad or m], others as the model has them."""
+        place = self.model.jnt_qposadr
         self.data.qpos[:] = self.model.qpos0
-        fixed = dict(zip(joints, values.tolist(), strict=True))
-        for joint, value in coupled_values(self.model, (), fixed).items():
-            self.data.qpos[self.model.jnt_qposadr[joint]] = value.offset
+        self.data.qpos[place[chain.driven]] = values
+        self.data.qpos[place[chain.followers.joints]] = chain.followers.values(values)
         mujoco.mj_kinematics(self.model, self.data)
 
     def range_of(self, joint: int, unlimited: float) -> tuple[float, float]:
@@ -314,57 +339,56 @@ class ModelSurvey:
 
     # ---- remote centre ---------------------------------------------------------------------------------------
 
-    def remote_centre(self, chain: Sequence[int], tip: int, offset: FloatArray) -> RemoteCentre | None:
+    def remote_centre(self, chain: Chain, tip: int, offset: FloatArray) -> RemoteCentre | None:
         """The point that the line of a shaft's slide passes in all poses, within CENTRE_TOLERANCE.
 
         In the frame of the shaft's link (position x, rotation R) the line passes through c along a. The point p and c
-        are the least-squares solution of (I - R a a^T R^T) (p - x - R c) = 0 over 2^POSES_POWER poses; they are a single one
-        if at least two driven joints turn the shaft.
+        are the least-squares solution of (I - R a a^T R^T) (p - x - R c) = 0 over 2^POSES_POWER poses. They are a
+        single one if at least two driven joints turn the shaft.
         """
         from scipy.stats.qmc import Sobol
 
         model = self.model
-        slides = [index for index, joint in enumerate(chain) if model.jnt_type[joint] == SLIDE]
+        slides = [index for index, joint in enumerate(chain.joints) if model.jnt_type[joint] == SLIDE]
         if not slides:
             return None
-        driven, slide = self.driven(chain), chain[slides[0]]
-        values = coupled_values(model, driven)
-        limits = narrowed_limits(model, driven, np.array([self.range_of(joint, np.inf) for joint in driven]))
-        inserting = values[slide].driver
-        if values[slide].slope == 0.0 or not np.isfinite(limits[driven.index(inserting)]).all():
+        driven, limits, slide = chain.driven, chain.limits, chain.joints[slides[0]]
+        roots = [joint_value(model, joint).root for joint in driven]
+        moving = [joint_value(model, joint) for joint in chain.joints[: slides[0] + 1]]
+        *turning, inserting = (roots.index(value.root) if value.slope != 0.0 else -1 for value in moving)
+        if inserting < 0 or not np.isfinite(limits[inserting]).all():
             return None
-        turning = {values[joint].driver for joint in chain[: slides[0]] if values[joint].slope != 0.0} - {inserting}
         lower, upper = np.where(np.isfinite(limits), limits, [-np.pi, np.pi]).T
-        self.place(driven, 0.5 * (lower + upper))
-        body = self._shaft_body(chain, slides[0])
-        shares = Sobol(len(driven), scramble=False).random_base2(POSES_POWER)
-        rows, right = np.zeros((len(shares), 3, 6)), np.zeros((len(shares), 3))
-        for pose, share in enumerate(shares):
-            self.place(driven, lower + share * (upper - lower))
+        self.place(chain, 0.5 * (lower + upper))
+        body = self._shaft_body(chain.joints, slides[0])
+        rows, right = [], []
+        for share in Sobol(len(driven), scramble=False).random_base2(POSES_POWER):
+            self.place(chain, lower + share * (upper - lower))
             axis = self.data.xaxis[slide]
             across = np.eye(3) - axis[:, None] * axis
-            rows[pose] = np.hstack([across, -matmul(across, self.data.xmat[body].reshape(3, 3))])
-            right[pose] = matmul(across, self.data.xpos[body])
-        sizes = svd(rows.reshape(-1, 6))[1]
-        # c is free along a; another free direction is that of an axis about which alone the shaft turns.
-        if sizes[-2] < 1e-2:
+            rows.append(np.hstack([across, -matmul(across, self.data.xmat[body].reshape(3, 3))]))
+            right.append(matmul(across, self.data.xpos[body]))
+        # c is free along a. Another free direction is that of an axis about which alone the shaft turns.
+        if svd(np.vstack(rows))[1][-2] < 1e-2:
             return None
-        solution = lstsq(rows.reshape(-1, 6), right.ravel())
-        missed = float(norm(matmul(rows, solution) - right, axis=1).max())
+        solution = lstsq(np.vstack(rows), np.concatenate(right))
+        missed = float(norm(matmul(np.array(rows), solution) - right, axis=1).max())
         if missed > CENTRE_TOLERANCE:
             return None
         point, on_line = np.split(solution, 2)
         axis, reach = matmul(self.data.xmat[body].reshape(3, 3).T, self.data.xaxis[slide]), []
-        for value in limits[driven.index(inserting)]:
-            joints = dict(zip(driven, model.qpos0[model.jnt_qposadr[driven]], strict=True)) | {inserting: value}
-            self.place(driven, np.array(list(joints.values())))
+        for end in limits[inserting]:
+            joints = np.clip(model.qpos0[model.jnt_qposadr[driven]], lower, upper)
+            joints[inserting] = end
+            self.place(chain, joints)
             along = matmul(self.data.xmat[body].reshape(3, 3), axis)
             tip_now = self.data.xpos[tip] + matmul(self.data.xmat[tip].reshape(3, 3), offset)
             reach.append(float(matmul(tip_now - point, along)))
         sign = float(np.sign(max(reach, key=abs)))
         least, most = sorted(sign * value for value in reach)
+        turning = frozenset(turning) - {inserting, -1}
         shaft_point = on_line - matmul(on_line, axis) * axis
-        return RemoteCentre(point, body, shaft_point, sign * axis, slide, frozenset(turning), (least, most), missed)
+        return RemoteCentre(point, body, shaft_point, sign * axis, slide, turning, (least, most), missed)
 
     def _shaft_body(self, chain: Sequence[int], slide: int) -> int:
         """The last body with no motion but along the line of a slide and about it, in the current pose."""

@@ -8,7 +8,14 @@ from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.instruments.arm.steering import SteeredArm
 from surgsim_env.instruments.arm.urdf import MESH_FORMATS, find_mesh, mesh_names
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.instruments.joint_couplings import coupled_values, leaders_of, narrowed_limits
+from surgsim_env.instruments.joint_couplings import (
+    Followers,
+    coupled_value,
+    couplings_to_root,
+    followers_of,
+    joint_value,
+    narrowed_limits,
+)
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
 __all__ = [
@@ -17,6 +24,7 @@ __all__ = [
     "SIDES",
     "Arm",
     "ArmInstrument",
+    "Followers",
     "Instrument",
     "Pair",
     "PoseSolution",
@@ -24,9 +32,11 @@ __all__ = [
     "ToolBodies",
     "check_port_outside",
     "compile_arm",
-    "coupled_values",
+    "coupled_value",
+    "couplings_to_root",
     "find_mesh",
-    "leaders_of",
+    "followers_of",
+    "joint_value",
     "load_arm",
     "mesh_names",
     "narrowed_limits",

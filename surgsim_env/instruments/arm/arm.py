@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from msdm_core.arithmetic import dot, eigh, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.support import Support
-from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm
-from surgsim_env.instruments.joint_couplings import followers_of
+from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm, followers_in
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
 from surgsim_env.scene.arm_description import ArmDescription, read_description
 from surgsim_env.scene.model import Port
@@ -54,7 +53,7 @@ class Arm:
         self.joints = description.joints
         index = [model.joint(name).id for name in self.joints]
         self.qpos, self.dof = model.jnt_qposadr[index], model.jnt_dofadr[index]
-        self.followers = followers_of(model, index)
+        self.followers = followers_in(model, description)
         self._follower_qpos = model.jnt_qposadr[self.followers.joints]
         self._follower_dof = model.jnt_dofadr[self.followers.joints]
         self.lower, self.upper = model.jnt_range[index, 0].copy(), model.jnt_range[index, 1].copy()
@@ -129,7 +128,7 @@ class Arm:
         return matmul(across, self.trocar - near), matmul(across, self.driven_columns(self._jacobian[:3]))
 
     def driven_columns(self, matrix: FloatArray) -> FloatArray:
-        """A matrix by the velocities of the model (m, nv), by those of the driven joints and their followers, (m, n)."""
+        """Columns of the driven joints (m, n), with their followers', of a matrix for all velocities (m, nv)."""
         columns = matrix[:, self.dof]
         followers = self.followers
         for dof, driver, slope in zip(self._follower_dof, followers.driver, followers.slope, strict=True):

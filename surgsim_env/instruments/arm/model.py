@@ -14,7 +14,7 @@ import numpy as np
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.urdf import prepare_urdf
-from surgsim_env.instruments.joint_couplings import coupled_values, joint_couplings, narrowed_limits
+from surgsim_env.instruments.joint_couplings import Followers, followers_of, narrowed_limits
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
@@ -54,7 +54,7 @@ def compile_arm(
             spec = arm_spec(description, port, tip_radius, timestep)
             add_supports(spec, supports, moving=supports_move)
             model = spec.compile()
-            _check_couplings(model, description)
+            _narrow_limits(model, description)
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
     _check_joints(model, description, where)
@@ -205,6 +205,9 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         if joint is not None:  # None for a held joint
             joint.range = np.array(limits) / _angle_unit(spec, joint)
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+    # Keyframes give a value for each joint and actuator of the file.
+    for key in list(spec.keys):
+        spec.delete(key)
     coupled: set[str] = set()
     for equality in spec.equalities:
         if equality.type == mujoco.mjtEq.mjEQ_JOINT:
@@ -288,9 +291,6 @@ def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
     for actuator in list(spec.actuators):
         if actuator.target in arm.joints:
             spec.delete(actuator)
-    # Keyframes give a control for each actuator of the file.
-    for key in list(spec.keys):
-        spec.delete(key)
     for index, name in enumerate(arm.joints):
         joint, effort = spec.joint(name), control.effort[index]
         if control.armature:
@@ -321,23 +321,21 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
         part.set_frame(frame)
 
 
-def _check_couplings(model: mujoco.MjModel, arm: ArmDescription) -> None:
-    """Check that joints follow driven ones by offset and multiplier, and narrow the driven joints' limits for them."""
+def _narrow_limits(model: mujoco.MjModel, arm: ArmDescription) -> None:
+    """Narrow the limits of driven joints to those of the joints that follow them."""
     driven = [model.joint(name).id for name in arm.joints]
-    moving = {joint for joint, value in coupled_values(model, driven).items() if value.slope != 0.0}
-    for coupling in joint_couplings(model):
-        if not coupling.linear and moving & {coupling.follower, coupling.leader}:
-            names = [model.joint(joint).name for joint in (coupling.follower, coupling.leader)]
-            raise ValueError(
-                f"joint {names[0]!r} follows {names[1]!r} by a polynomial {coupling.coefficients.tolist()}; a joint of "
-                "an arm follows by its first two numbers: set the others to 0, or hold one of the joints (held)"
-            )
-    limited = model.jnt_limited[driven].astype(bool)
-    own = np.where(limited[:, None], model.jnt_range[driven], [-np.inf, np.inf])
-    narrow = narrowed_limits(model, driven, own)
-    bounded = np.isfinite(narrow).all(axis=1)
-    model.jnt_range[np.array(driven)[bounded]] = narrow[bounded]
-    model.jnt_limited[np.array(driven)[bounded]] = 1
+    limited = model.jnt_limited[driven].astype(bool)[:, None]
+    own = np.where(limited, model.jnt_range[driven], [-np.inf, np.inf])
+    narrow = narrowed_limits(model, driven, followers_in(model, arm), own)
+    for joint, limits in zip(driven, narrow, strict=True):
+        if np.isfinite(limits).all():
+            model.jnt_limited[joint], model.jnt_range[joint] = 1, limits
+
+
+def followers_in(model: mujoco.MjModel, arm: ArmDescription) -> Followers:
+    """The followers of an arm's driven joints in its compiled model; the fingers of a jaw have drives of their own."""
+    driven, jaw = ([model.joint(name).id for name in names] for names in (arm.joints, arm.jaw))
+    return followers_of(model, driven, [joint for joint in range(model.njnt) if joint not in jaw])
 
 
 def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:

@@ -8,6 +8,14 @@ from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.instruments.arm.steering import SteeredArm
 from surgsim_env.instruments.arm.urdf import MOMENTS, shape_faults
 from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.joint_couplings import (
+    Followers,
+    coupled_value,
+    couplings_to_root,
+    followers_of,
+    joint_value,
+    narrowed_limits,
+)
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
 __all__ = [
@@ -16,6 +24,7 @@ __all__ = [
     "SIDES",
     "Arm",
     "ArmInstrument",
+    "Followers",
     "Instrument",
     "Pair",
     "PoseSolution",
@@ -23,8 +32,13 @@ __all__ = [
     "ToolBodies",
     "check_port_outside",
     "compile_arm",
+    "coupled_value",
+    "couplings_to_root",
+    "followers_of",
     "hold_joints",
+    "joint_value",
     "load_arm",
+    "narrowed_limits",
     "parked_place",
     "position_actuator",
     "read_model",

@@ -26,15 +26,24 @@ from surgsim_apps.arms.survey import (
     meeting_point,
     vector,
 )
-from surgsim_env.instruments import Arm, PoseSolution, compile_arm, position_actuator, solve_pose
+from surgsim_env.instruments import (
+    Arm,
+    PoseSolution,
+    compile_arm,
+    coupled_value,
+    couplings_to_root,
+    joint_value,
+    position_actuator,
+    solve_pose,
+)
 from surgsim_env.scene import AddedShape, ArmDescription, JointControl, Port, Tip, Trocar, Vector, tangent_axes
 
 # A palpator's dimensions [m]: an 8 mm shaft, a thinner neck behind the ball, whose radius a scene sets.
 SHAFT_RADIUS, NECK_RADIUS, NECK_LENGTH, BALL_RADIUS = 0.004, 0.003, 0.024, 0.005
 # Length of a palpator that is mounted on an arm without a straight shaft [m].
 TOOL_LENGTH = 0.40
-# Depth of the tip past the trocar at home [m].
-HOME_DEPTH = 0.10
+# Depth of the tip past the trocar at home [m]; with a remote centre that far at least from the ends of the insertion.
+HOME_DEPTH, HOME_MARGIN = 0.10, 0.04
 # Servos, chosen: natural frequency of each joint [rad/s] and its smallest stiffness at the tip [N/m]: 5 N move it by
 # 0.1 mm.
 NATURAL_FREQUENCY, TIP_STIFFNESS = 2.0 * math.pi * 30.0, 5e4
@@ -43,8 +52,8 @@ LEVER_LEAST, TIP_FORCE = 0.02, 50.0
 # Speed limits for a model without them [rad/s], [m/s]; range of joints without limits [rad], [m].
 TURN_SPEED, SLIDE_SPEED = 2.0, 0.4
 TURN_RANGE, SLIDE_RANGE = 2.0 * math.pi, 0.5
-# Places for judging a home: depths past the trocar [m], straight on and tilted by an angle [rad] to four sides.
-DEPTHS, TILT = (0.06, 0.10, 0.14), math.radians(25.0)
+# Places for judging a home: depths from its own [m], straight on and tilted by an angle [rad] to four sides.
+DEPTHS, TILT = (-HOME_MARGIN, 0.0, HOME_MARGIN), math.radians(25.0)
 # Poses drawn at random, and number of the best to be tried.
 POSES_DRAWN, POSES_TRIED = 3000, 20
 # Tolerances of the trocar [m]: with a remote centre the file's rounding, else what control keeps at home.
@@ -52,7 +61,7 @@ FIXED_TOLERANCE, KEPT_TOLERANCE = 1e-4, 1e-5
 # Parts up to this size are no outer links [m].
 SMALL_PART = 0.04
 ONE_MM = 1e-3
-FREE, COUPLING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtEq.mjEQ_JOINT)
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 @dataclass(frozen=True)
@@ -122,7 +131,8 @@ class _Finder:
         self.notes, self.chosen = [], []
         body, offset = survey.find_tip(tip)
         self.chain = survey.chain(body)
-        self.names = [self.model.joint(joint).name for joint in self.chain]
+        self.moved, self.driven, self.followers = self.chain.joints, self.chain.driven, self.chain.followers
+        self.names = [self.model.joint(joint).name for joint in self.driven]
         limits = self._limits()
         self.lower, self.upper = np.array(limits).T
         self.zero = np.clip(0.0, self.lower, self.upper)
@@ -131,6 +141,11 @@ class _Finder:
         if tool_length is None:
             centre = survey.remote_centre(self.chain, body, np.zeros(3) if offset is None else offset)
         self.centre = centre
+        self.depth = HOME_DEPTH
+        if centre is not None:
+            least, most = centre.depths
+            margin = min(HOME_MARGIN, 0.5 * (most - least))
+            self.depth = round(min(max(HOME_DEPTH, least + margin), most - margin), 6)
         survey.place(self.chain, self.zero)
         self.tool = self._find_tool(body, offset, tool_length)
         self.links, link_shapes = self._find_links()
@@ -147,33 +162,52 @@ class _Finder:
     # ---- findings in the file --------------------------------------------------------------------------------
 
     def _limits(self) -> list[tuple[float, float]]:
-        limits = []
-        self.given_limits: dict[str, tuple[float, float]] = {}
-        for joint, name in zip(self.chain, self.names, strict=True):
-            slides = self.model.jnt_type[joint] == SLIDE
-            limits.append(self.survey.range_of(joint, SLIDE_RANGE if slides else TURN_RANGE))
-            if not self.model.jnt_limited[joint]:
-                self.given_limits[name] = (round(limits[-1][0], 9), round(limits[-1][1], 9))
-        if self.given_limits:
+        stated = self.chain.limits
+        slides = self.model.jnt_type[self.driven] == SLIDE
+        most = np.where(slides, SLIDE_RANGE, TURN_RANGE)
+        limits = np.where(np.isfinite(stated), stated, np.stack([-most, most], axis=1))
+        pairs = zip(self.names, limits.round(9).tolist(), strict=True)
+        own = np.array([self.survey.range_of(joint, math.inf) for joint in self.driven])
+        crossed = np.isin(self.names, list(self.survey.crossed))
+        changed = (limits != own).any(axis=1)
+        written = zip(changed | crossed, pairs, strict=True)
+        self.given_limits = {name: (low, high) for new, (name, (low, high)) in written if new}
+        free = [name for name, pair in zip(self.names, stated, strict=True) if not np.isfinite(pair).all()]
+        narrowed = [name for new, name in zip(changed, self.names, strict=True) if new and name not in free]
+        if narrowed:
+            self.chosen.append(f"limits are narrowed to those of coupled joints: {', '.join(narrowed)}")
+        if free:
             self.chosen.append(
-                f"joints without limits ({', '.join(self.given_limits)}) get one turn to either side, or -0.5 to 0.5 m"
+                f"joints without limits ({', '.join(free)}) get one turn to either side, or -0.5 to 0.5 m"
             )
-        return limits
+        return [(low, high) for low, high in limits.tolist()]
 
     def _say_model(self, body: int) -> None:
         survey = self.survey
-        self.notes.append(f"chain of {len(self.chain)} joints: {', '.join(self.names)}")
+        self.notes.append(f"chain of {len(self.driven)} joints: {', '.join(self.names)}")
+        for index, name in enumerate(self.names):
+            led = self.followers.joints[(self.followers.driver == index) & (self.followers.slope != 0.0)]
+            names = [self.model.joint(joint).name for joint in led if joint in self.moved]
+            if names:
+                self.notes.append(f"coupled to {name}: {', '.join(names)}")
         self.notes.append(f"its end: {survey.body_name(body)}")
-        if survey.dropped_meshes:
-            self.chosen.append(
-                f"{len(survey.dropped_meshes)} meshes are left out, not found or not read by MuJoCo: "
-                f"{_listed(survey.dropped_meshes)}"
-            )
+        for fault, places in survey.left_out.items():
+            self.chosen.append(f"shapes left out: {_listed(places)} ({fault})")
+        if survey.crossed:
+            pairs = [f"{name} {low:g} to {high:g}" for name, (low, high) in survey.crossed.items()]
+            self.chosen.append(f"limits whose lower is above the upper one are used in order: {_listed(pairs)}")
+        if survey.locked:
+            values = [f"{name} at {value:g}" for name, value in survey.locked.items()]
+            self.chosen.append(f"joints with equal limits, and those coupled to them, are held: {_listed(values)}")
         if survey.inertias:
             self.chosen.append(
                 "links without a valid inertia get that of a block around their shapes: "
                 f"{_listed([inertia.link for inertia in survey.inertias])}"
             )
+
+    @property
+    def _last_name(self) -> str:
+        return self.model.joint(self.moved[-1]).name
 
     # ---- shaft and tip ---------------------------------------------------------------------------------------
 
@@ -199,9 +233,13 @@ class _Finder:
         """The shaft through a remote centre, the links of a wrist beyond it, and a ball at the tip."""
         point = vector(centre.point, 4)
         self.notes.append(f"remote centre at {point} m: the mechanism keeps the shaft there")
-        low, high = self.survey.range_of(centre.joint, 0.0)
+        if centre.missed > FIXED_TOLERANCE:
+            self.chosen.append(
+                f"by the model's lengths the shaft leaves its remote centre by up to {1e3 * centre.missed:.1f} mm"
+            )
         along = matmul(self.survey.data.xmat[centre.body].reshape(3, 3), centre.shaft_axis)
-        return self._wristed(centre.body, centre.shaft_point, centre.shaft_axis, along, body, offset, high - low + 0.05)
+        length = centre.depths[1] - centre.depths[0] + 0.05
+        return self._wristed(centre.body, centre.shaft_point, centre.shaft_axis, along, body, offset, length)
 
     def _own_shaft(self, carrier: int, body: int, offset: FloatArray | None) -> _Tool:
         """A straight thin part of the model as the shaft."""
@@ -233,7 +271,7 @@ class _Finder:
         length: float,
     ) -> _Tool:
         survey = self.survey
-        beyond = [j for j in self.chain if shaft_body in survey.parents(int(self.model.jnt_bodyid[j]))[1:]]
+        beyond = [j for j in self.moved if shaft_body in survey.parents(int(self.model.jnt_bodyid[j]))[1:]]
         anchors = [survey.data.xanchor[joint].copy() for joint in beyond]
         bodies = [shaft_body, *(int(self.model.jnt_bodyid[joint]) for joint in beyond)]
         last = anchors[-1] if anchors else self._world(shaft_body, point)
@@ -283,7 +321,7 @@ class _Finder:
             return survey.data.xpos[body].copy()
         mean = points.mean(axis=0) - last
         out = mean / norm(mean) if norm(mean) > ONE_MM else along
-        self.chosen.append(f"no frame marks the tip: it is the farthest point of the links beyond {self.names[-1]!r}")
+        self.chosen.append(f"no frame marks the tip: it is the farthest point of the links beyond {self._last_name!r}")
         return last + max(float(matmul(points - last, out).max()), 0.0) * out
 
     def _own_contact(self, shaft_body: int, tip: FloatArray) -> tuple[str, ...]:
@@ -301,7 +339,7 @@ class _Finder:
 
     def _mounted_tool(self, body: int, offset: FloatArray | None, length: float) -> _Tool:
         """A straight palpator along the axis of the last hinge, from the outer face of the last link."""
-        survey, joint = self.survey, self.chain[-1]
+        survey, joint = self.survey, self.moved[-1]
         anchor, axis = survey.data.xanchor[joint].copy(), survey.data.xaxis[joint].copy()
         link = int(self.model.jnt_bodyid[joint])
         cloud = survey.data.xpos[link] + matmul(survey.body_points(link), survey.data.xmat[link].reshape(3, 3).T)
@@ -325,7 +363,7 @@ class _Finder:
         )
         self.chosen.append(
             f"the model has no straight shaft (at least 100 mm long, at most 16 mm thick): a palpator "
-            f"{1e3 * length:.0f} mm long is mounted on {survey.body_name(body)!r} along the axis of {self.names[-1]!r}"
+            f"{1e3 * length:.0f} mm long is mounted on {survey.body_name(body)!r} along the axis of {self._last_name!r}"
         )
         direction = self._turned(body, along)
         contact = tuple(shape.name for shape in shapes)
@@ -397,7 +435,7 @@ class _Finder:
             # The mechanism of a remote centre holds its tool by links about it.
             if home is None or (self.centre is None and self._blocked(arm, home)):
                 continue
-            share = reach_share(arm, home, into)
+            share = reach_share(arm, home, into, self.depth)
             if best is None or share > best[3] + 1e-9:
                 best = home, arm.trocar.copy(), into, share
             if share == 1.0:
@@ -405,8 +443,9 @@ class _Finder:
         if best is None:
             what = "the trocar" if self.trocar_given is None else f"the trocar at {vector(self.trocar_given, 4)}"
             raise ValueError(
-                f"model file {self.survey.path}: no pose was found with the shaft in {what} and the tip "
-                f"{1e3 * HOME_DEPTH:.0f} mm past it: move it with --trocar, or name another --tip"
+                f"model file {self.survey.path}: no pose was found with the shaft in {what}, the tip "
+                f"{1e3 * self.depth:.0f} mm past it and the tool outside other links: move it with --trocar, or name "
+                "another --tip"
             )
         return best
 
@@ -423,14 +462,14 @@ class _Finder:
         point, into = arm.shaft_line(start)
         tip = arm.tip_pose(start).position
         self.survey.place(self.chain, start)
-        anchor, axis = self.survey.data.xanchor[self.chain[0]], self.survey.data.xaxis[self.chain[0]]
+        anchor, axis = self.survey.data.xanchor[self.moved[0]], self.survey.data.xaxis[self.moved[0]]
         crossing = meeting_point(np.stack([point, anchor]), np.stack([into, axis]))
         behind = point + (matmul(tip - point, into) - HOME_DEPTH) * into
         return [behind] if crossing is None else [crossing, behind]
 
     def _at_depth(self, arm: Arm, trocar: FloatArray, into: FloatArray, start: FloatArray) -> FloatArray | None:
-        """Joint values near a start with the tip HOME_DEPTH past the trocar, pointing along the shaft if it can."""
-        place = trocar + HOME_DEPTH * into
+        """Joint values near a start with the tip at its depth past the trocar, pointing along the shaft if it can."""
+        place = trocar + self.depth * into
         for direction in (into, None):
             pose = solve_pose(arm, place, direction=direction, start=start)
             if pose.position_error < 1e-6 and self._in_trocar(arm, pose) and (direction is None or pose.reached):
@@ -438,20 +477,20 @@ class _Finder:
         return None
 
     def _in_trocar(self, arm: Arm, pose: PoseSolution) -> bool:
-        return pose.trocar_error <= (FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6)
+        return pose.trocar_error <= 1e-6
 
     def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
-        """Poses with different joints before the slide of a remote centre."""
-        before = np.arange(len(self.chain)) < self.chain.index(centre.joint)
-        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.chain)))
+        """Poses with different joints that turn the shaft about a remote centre."""
+        before = np.isin(np.arange(len(self.driven)), list(centre.turning))
+        draws = np.random.default_rng(0).uniform(self.lower, self.upper, (POSES_TRIED, len(self.driven)))
         return [np.where(before, pose, self.zero) for pose in (self.zero, 0.5 * (self.lower + self.upper), *draws)]
 
     def _good_starts(self, arm: Arm) -> list[FloatArray]:
         """Poses with the tool pointing down, away from limits and singular poses, the best first; keyframes before."""
-        own = [self.model.key_qpos[key][self.model.jnt_qposadr[self.chain]] for key in range(self.model.nkey)]
+        own = [self.model.key_qpos[key][self.model.jnt_qposadr[self.driven]] for key in range(self.model.nkey)]
         own = [key.clip(self.lower, self.upper) for key in own]
         lower, upper = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
-        draws = np.random.default_rng(0).uniform(lower, upper, (POSES_DRAWN, len(self.chain)))
+        draws = np.random.default_rng(0).uniform(lower, upper, (POSES_DRAWN, len(self.driven)))
         worth = np.array([self._worth(arm, pose) for pose in draws])
         order = np.argsort(-worth)[:POSES_TRIED]
         return [*own, self.zero, *draws[order]]
@@ -463,8 +502,14 @@ class _Finder:
         return (1.0 - arm.tip_direction(pose)[2]) * min(float(margin.min()) / 0.1, 1.0) * least
 
     def _blocked(self, arm: Arm, joints: FloatArray) -> bool:
-        """True if the tool passes through a link other than its carrier or the links next to it."""
-        carriers = {self.survey.body_name(part) for part in self.survey.parents(self.tool.shaft_body)[:3]}
+        """True if the tool passes through a link other than its carrier, those beyond or the two before it."""
+        survey, end = self.survey, int(self.model.jnt_bodyid[self.moved[-1]])
+        # Frames fixed to a link count with it, and so do the fingers of a hand that holds the tool.
+        parents = survey.parents(self.tool.shaft_body)
+        last = [*(part for part in parents if survey.body_joints(part)), parents[-1]][:3][-1]
+        near = {*parents[: parents.index(last) + 1]}
+        near |= {part for part in range(1, self.model.nbody) if end in survey.parents(part)}
+        carriers = {survey.body_name(part) for part in near}
         model, data = arm.model, mujoco.MjData(arm.model)
         arm.write(data, joints)
         mujoco.mj_kinematics(model, data)
@@ -478,16 +523,21 @@ class _Finder:
 
     def _speed_limits(self) -> tuple[float, ...]:
         stated = self.survey.speed_limits
-        slides = self.model.jnt_type[self.chain] == SLIDE
+        slides = self.model.jnt_type[self.driven] == SLIDE
         default = np.where(slides, SLIDE_SPEED, TURN_SPEED)
-        return tuple(stated.get(name, float(speed)) for name, speed in zip(self.names, default, strict=True))
+        speed = np.array([stated.get(name, value) for name, value in zip(self.names, default, strict=True)])
+        for joint, driver, slope, _ in zip(*self.followers, strict=True):
+            if slope != 0.0:
+                most = stated.get(self.model.joint(joint).name, math.inf) / abs(slope)
+                speed[driver] = min(speed[driver], most)
+        return tuple(speed.tolist())
 
     def _control(self, arm: Arm, home: FloatArray) -> JointControl:
         """The model's own position actuators, if each joint has a usable one, else servos for these joints."""
         speed = self._speed_limits()
         model = self.model
         actuators = [position_actuator(model, name) for name in self.names]
-        if all(a >= 0 and self._covers(a, j) for a, j in zip(actuators, self.chain, strict=True)):
+        if all(a >= 0 and self._covers(a, index) for index, a in enumerate(actuators)):
             self.notes.append("driven by the model's own position actuators")
             return JointControl("position", speed)
         if model.nu:
@@ -496,47 +546,41 @@ class _Finder:
             )
         else:
             self.chosen.append("the model has no actuators: servos are added")
-        inertia, own = joint_inertia(arm, home), model.dof_armature[model.jnt_dofadr[self.chain]]
+        inertia, own = joint_inertia(arm, home), model.dof_armature[model.jnt_dofadr[self.driven]]
         lever = norm(arm.tip_jacobian(home)[:3], axis=0)
-        slides = model.jnt_type[self.chain] == SLIDE
+        slides = model.jnt_type[self.driven] == SLIDE
         lever = np.where(slides, 1.0, np.maximum(lever, LEVER_LEAST))
         least = TIP_STIFFNESS * (lever * lever) / (NATURAL_FREQUENCY * NATURAL_FREQUENCY)
         armature = np.maximum(own, least - (inertia - own))
         total = inertia - own + armature
         stiffness, damping = total * (NATURAL_FREQUENCY * NATURAL_FREQUENCY), 2.0 * total * NATURAL_FREQUENCY
         effort = TIP_FORCE * lever + total * np.array(speed) / 0.1
-        stated = model.jnt_actfrcrange[self.chain, 1]
-        effort = np.where(model.jnt_actfrclimited[self.chain].astype(bool) & (stated > 0.0), stated, effort)
+        stated = model.jnt_actfrcrange[self.driven, 1]
+        effort = np.where(model.jnt_actfrclimited[self.driven].astype(bool) & (stated > 0.0), stated, effort)
         return JointControl("servo", speed, *(_figures(values) for values in (stiffness, damping, effort, armature)))
 
-    def _covers(self, actuator: int, joint: int) -> bool:
+    def _covers(self, actuator: int, index: int) -> bool:
         if not self.model.actuator_ctrllimited[actuator]:
             return True
         least, most = self.model.actuator_ctrlrange[actuator]
-        lower, upper = self.model.jnt_range[joint]
-        return bool(least <= lower + 1e-9 and most >= upper - 1e-9)
+        return bool(least <= self.lower[index] + 1e-9 and most >= self.upper[index] - 1e-9)
 
     def _held(self, home: FloatArray) -> dict[str, float]:
-        """Values of undriven joints: as coupled to driven ones at home, else 0 or the nearest limit."""
-        model = self.model
-        known = dict(zip(self.chain, home, strict=True))
-        pairs = [
-            (int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e])
-            for e in range(model.neq)
-            if model.eq_type[e] == COUPLING and int(model.eq_obj2id[e]) >= 0
-        ]
-        for _ in pairs:
-            for follower, master, (offset, factor, *_rest) in pairs:
-                if master in known and follower not in known:
-                    known[follower] = offset + factor * known[master]
-                elif follower in known and master not in known and factor != 0.0:
-                    known[master] = (known[follower] - offset) / factor
+        """Values of undriven joints: as coupled to driven ones at home, or to a root at 0 or the nearest limit."""
+        model, survey, values = self.model, self.survey, {}
+        for joint, value in zip(self.driven, home, strict=True):
+            root, slope, offset = joint_value(model, joint)
+            values[root] = float(value - offset) / slope
+        # Joints that two of the chain follow move with it.
+        roots = [joint_value(model, joint).root for joint in self.moved]
+        shared = [joint for joint, root in zip(self.moved, roots, strict=True) if roots.count(root) > 1]
         held = {}
-        for joint in range(model.njnt):
-            if joint in self.chain or model.jnt_type[joint] == FREE:
-                continue
-            low, high = self.survey.range_of(joint, math.inf)
-            held[model.joint(joint).name] = round(float(np.clip(known.get(joint, 0.0), low, high)), 9) + 0.0
+        for joint in sorted(set(range(model.njnt)).difference(self.moved, survey.leaders(shared))):
+            if model.jnt_type[joint] != FREE:
+                couplings = couplings_to_root(model, joint)
+                root = couplings[-1].leader if couplings else joint
+                value = values.get(root, float(np.clip(0.0, *survey.range_of(root, math.inf))))
+                held[model.joint(joint).name] = round(coupled_value(model, couplings, value), 9) + 0.0
         return held
 
     def _description(
@@ -548,7 +592,10 @@ class _Finder:
         into: FloatArray,
     ) -> ArmDescription:
         survey, tool = self.survey, self.tool
-        fixed = self.centre is not None
+        fixed, tolerance = self.centre is not None, KEPT_TOLERANCE
+        if self.centre is not None:
+            # Other poses than those tried may miss it by a little more.
+            tolerance = max(FIXED_TOLERANCE, round(1.2 * self.centre.missed, 4))
         return ArmDescription(
             name=survey.path.stem,
             folder=survey.path.parent,
@@ -570,12 +617,12 @@ class _Finder:
                 point=vector(point),
                 into=vector(into),
                 fixed=fixed,
-                tolerance=FIXED_TOLERANCE if fixed else KEPT_TOLERANCE,
+                tolerance=tolerance,
             ),
             control=control,
             home={name: round(float(value), 9) + 0.0 for name, value in zip(self.names, home, strict=True)},
             limits=self.given_limits,
-            held=self._held(home),
+            held={**survey.locked, **self._held(home)},
             shapes=(*tool.shapes, *link_shapes),
             inertias=survey.inertias,
             dropped_meshes=survey.dropped_meshes,
@@ -594,35 +641,36 @@ class _Finder:
         arm = self._search_arm(link_shapes)
         control = self._control(arm, clipped)
         description = self._description(link_shapes, control, clipped, point, into)
-        if description.held:
-            self.chosen.append(f"joints that do not move the tip are held: {_listed(list(description.held))}")
+        held = [name for name in description.held if name not in self.survey.locked]
+        if held:
+            self.chosen.append(f"joints that do not move the tip are held: {_listed(held)}")
         if self.centre is None and self.trocar_given is None:
             self.chosen.append(f"trocar at {vector(point, 4)} m of the model's frame; --trocar x,y,z sets another one")
         self.notes.append(
-            f"home with the tip {1e3 * HOME_DEPTH:.0f} mm past the trocar; the tip reaches {reach:.0%} of the places "
-            f"6 to 14 cm past it, up to {math.degrees(TILT):.0f} degrees aside"
+            f"home with the tip {1e3 * self.depth:.0f} mm past the trocar; the tip reaches {reach:.0%} of the places "
+            f"{1e2 * (self.depth + DEPTHS[0]):.0f} to {1e2 * (self.depth + DEPTHS[-1]):.0f} cm past it, up to "
+            f"{math.degrees(TILT):.0f} degrees aside"
         )
         return FoundArm(description, self.notes, self.chosen, reach)
 
 
-def reach_share(arm: Arm, home: FloatArray, into: FloatArray) -> float:
-    """Share of places in reach, of those at DEPTHS past the trocar, straight on and tilted by TILT to four sides."""
+def reach_share(arm: Arm, home: FloatArray, into: FloatArray, depth: float) -> float:
+    """Share of places in reach, of those at DEPTHS about a depth [m], straight on and tilted by TILT to four sides."""
     sides = np.stack(tangent_axes(into))
     ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for axis in sides for side in (axis, -axis))]
-    places = [arm.trocar + depth * way for way in ways for depth in DEPTHS]
-    kept = FIXED_TOLERANCE if arm.remote_centre_fixed else 1e-6
+    places = [arm.trocar + (depth + further) * way for way in ways for further in DEPTHS]
     poses = [solve_pose(arm, place, start=home, iterations=60) for place in places]
-    return float(np.mean([pose.position_error < 1e-6 and pose.trocar_error <= kept for pose in poses]))
+    return float(np.mean([pose.position_error < 1e-6 and pose.trocar_error <= 1e-6 for pose in poses]))
 
 
 def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:
-    """Inertia of each driven joint, the diagonal of the mass matrix [kg m^2 or kg], shape (n,)."""
+    """Inertia of each driven joint with its followers, the diagonal of the mass matrix [kg m^2 or kg], shape (n,)."""
     data = mujoco.MjData(arm.model)
     arm.write(data, joints)
     mujoco.mj_forward(arm.model, data)
     inertia = np.zeros((arm.model.nv, arm.model.nv))
     mujoco.mj_fullM(arm.model, data, inertia)
-    return np.diag(inertia)[arm.dof]
+    return np.diag(arm.driven_columns(arm.driven_columns(inertia).T))
 
 
 def _added(name: str, body: str, capsule: Capsule) -> AddedShape:

@@ -45,7 +45,7 @@ class Candidates:
     Fields:
         joints: [rad or m]                                          (n, k, n_joint)
         position_error: of the tip [m]                              (n, k)
-        trocar_error: of the shaft's axis [m]                       (n, k)
+        trocar_error: of the shaft's axis beyond the arm's play [m] (n, k)
         pointing: unit vector out of the tip                        (n, k, 3)
     """
 
@@ -88,7 +88,8 @@ def search_joints(kinematics: BatchKinematics, wanted: Wanted, start: FloatArray
         _iterate(kinematics, wanted.only(np.arange(len(joints)), direction=False), joints, POLISHING)
     chain = kinematics.at(joints, shapes=False)
     missed = np.linalg.norm(wanted.position - chain.tip, axis=1)
-    return Candidates(joints, missed, kinematics.trocar_error(chain), chain.direction)
+    beside = np.maximum(kinematics.trocar_error(chain) - kinematics.arm.trocar_play, 0.0)
+    return Candidates(joints, missed, beside, chain.direction)
 
 
 def _iterate(kinematics: BatchKinematics, wanted: Wanted, joints: FloatArray, count: int) -> None:

@@ -22,7 +22,7 @@ class Chain:
         direction: unit vector out of the tip                           (n, 3)
         near, along: the shaft's point nearest to the trocar [m] and its direction to the tip       (n, 3)
         shape_ends: ends of the outer shapes' axes [m]                  (n, n_shape, 2, 3)
-        axes, anchors: of the driven joints [m]                         (n, n_joint, 3)
+        axes, anchors: of the driven joints and their followers [m]     (n, n_moved, 3)
     """
 
     tip: FloatArray
@@ -40,7 +40,7 @@ class BatchKinematics:
     Fields:
         arm: the arm
         lower, upper: limits [rad or m]                     (n_joint,)
-        hinge: True for a hinge, False for a slide          (n_joint,)
+        hinge: True for a hinge, False for a slide, of the driven joints and their followers      (n_moved,)
         shaft_index: shapes of the shaft's body             (k,)
         distal: True for shapes of the shaft or beyond      (n_shape,)
         effort: largest torque or force of each joint [N m or N], inf for a model without it  (n_joint,)
@@ -51,7 +51,8 @@ class BatchKinematics:
         model = arm.model
         self.arm = arm
         self.lower, self.upper = arm.lower, arm.upper
-        self._joint_of = {model.joint(name).id: index for index, name in enumerate(arm.joints)}
+        driven = [model.joint(name).id for name in arm.joints]
+        self._joint_of = {int(joint): index for index, joint in enumerate((*driven, *arm.followers.joints))}
         self._body_rotation = [_rotation(quaternion) for quaternion in model.body_quat]
         self._tip_body = int(model.site_bodyid[arm.tip_site])
         self._tip_position = model.site_pos[arm.tip_site].copy()
@@ -68,7 +69,7 @@ class BatchKinematics:
             self._shape_local[index] = model.geom_pos[geom] - axis, model.geom_pos[geom] + axis
         self.shaft_index: IntArray = np.flatnonzero(self._shape_body == arm.shaft).astype(np.int32)
         self.distal = np.array([arm.shaft in _ancestors(model, int(body)) for body in self._shape_body])
-        self.effort = np.array([_effort(model, joint) for joint in self._joint_of])
+        self.effort = np.array([_effort(model, joint) for joint in driven])
 
     def at(self, joints: FloatArray, *, shapes: bool = True) -> Chain:
         """Tip, shaft, joint axes and (unless left out) shapes at joint values (n, n_joint)."""
@@ -86,11 +87,12 @@ class BatchKinematics:
         return Chain(tip, rotation[self._tip_body] @ self._tip_axis, near, along, ends, axes, anchors)
 
     def _bodies(self, joints: FloatArray) -> tuple[list[FloatArray], list[FloatArray], FloatArray, FloatArray]:
-        """Rotation (n, 3, 3) and position (n, 3) of every body, axes and anchors of the driven joints."""
+        """Rotation (n, 3, 3) and position (n, 3) of every body, axes and anchors of the joints that move."""
         model, count = self.arm.model, len(joints)
         rotation = [np.broadcast_to(np.eye(3), (count, 3, 3))]
         position = [np.zeros((count, 3))]
-        axes, anchors = np.zeros((2, count, self.arm.joint_count, 3))
+        axes, anchors = np.zeros((2, count, len(self._joint_of), 3))
+        values = np.concatenate([joints, self.arm.followers.values(joints)], axis=1)
         for body in range(1, model.nbody):
             parent = model.body_parentid[body]
             place = position[parent] + rotation[parent] @ model.body_pos[body]
@@ -102,7 +104,7 @@ class BatchKinematics:
                 if index is None:
                     continue  # a finger of the jaw, which stays closed
                 axes[:, index], anchors[:, index] = axis, anchor
-                value = joints[:, index] - model.qpos0[model.jnt_qposadr[joint]]
+                value = values[:, index] - model.qpos0[model.jnt_qposadr[joint]]
                 if self.hinge[index]:
                     turn = turn @ _turns(model.jnt_axis[joint], value)
                     place = anchor - turn @ model.jnt_pos[joint]
@@ -123,7 +125,11 @@ class BatchKinematics:
     def _jacobian(self, chain: Chain, point: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
         turning = chain.axes * (self.hinge & moves)[:, None]
         linear = cross(turning, point[:, None] - chain.anchors) + chain.axes * (~self.hinge & moves)[:, None]
-        return np.swapaxes(linear, 1, 2), np.swapaxes(turning, 1, 2)
+        followers, count = self.arm.followers, self.arm.joint_count
+        for index, (driver, slope) in enumerate(zip(followers.driver, followers.slope, strict=True), start=count):
+            linear[:, driver] += slope * linear[:, index]
+            turning[:, driver] += slope * turning[:, index]
+        return np.swapaxes(linear[:, :count], 1, 2), np.swapaxes(turning[:, :count], 1, 2)
 
     def trocar_error(self, chain: Chain) -> FloatArray:
         """Distance of the shaft from the trocar [m], (n,).

@@ -1,6 +1,8 @@
 """Survey of a model file: joints of its tip, outer shapes, straight shaft, remote centre."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,10 +10,22 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from msdm_core.arithmetic import cbrt, cos, dot, eigh, matmul, norm, sin, solve
+from msdm_core.arithmetic import cbrt, cos, dot, eigh, lstsq, matmul, norm, sin, solve, svd
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
-from surgsim_env.instruments import MESH_FORMATS, find_mesh, mesh_names, read_model, read_xml
+from surgsim_env.instruments import (
+    Followers,
+    coupled_value,
+    couplings_to_root,
+    followers_of,
+    hold_joints,
+    joint_value,
+    narrowed_limits,
+    read_model,
+    read_xml,
+    shape_faults,
+    warned,
+)
 from surgsim_env.scene import LinkInertia, Vector, nearest
 
 # Densities of links without a mass and of links without a shape [kg/m^3]: chosen, water and aluminium.
@@ -22,8 +36,13 @@ BARE_MASS = 0.01
 THICKNESS_LEAST = 0.002
 # A part is a straight shaft if it is this long and no thicker [m].
 SHAFT_LENGTH_LEAST, SHAFT_RADIUS_MOST = 0.10, 0.008
+# Largest size of a shape and distance of a link from its parent, smallest size of a mesh [m]: beyond, a unit is wrong.
+LENGTH_MOST, MESH_LEAST = 5.0, 0.001
 # Largest distance of axes from their meeting point [m].
 MEETING_TOLERANCE = 1e-4
+# A shaft has a remote centre if it passes a point by no more in 2^8 poses [m]: chosen, for the parallelogram of
+# jhu-dvrk/dvrk_model's da Vinci Si, which leaves it by 4 mm.
+CENTRE_TOLERANCE, POSES_POWER = 5e-3, 8
 # Words in the names of frames at a tool's tip.
 TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
 # As numbers: a numpy integer equals no member of MuJoCo's enumerations.
@@ -62,6 +81,9 @@ class RemoteCentre:
         body: of the shaft
         shaft_point, shaft_axis: in that body's frame [m], the axis towards the tip (3,)
         joint: the slide for inserting the shaft
+        turning: indices of the driven joints that turn the shaft about the point
+        depths: least and largest depth of the tip past the point, its wrist straight [m]  (2,)
+        missed: largest distance of the shaft's axis from the point [m]
     """
 
     point: FloatArray
@@ -69,6 +91,26 @@ class RemoteCentre:
     shaft_point: FloatArray
     shaft_axis: FloatArray
     joint: int
+    turning: frozenset[int]
+    depths: tuple[float, float]
+    missed: float
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Joints that move a tip.
+
+    Fields:
+        joints: from the base to the tip
+        driven: those of them with a drive, n
+        followers: the others, and joints beside the chain that its joints follow
+        limits: of the driven joints, within those of their followers; infinite without any [rad or m]   (n, 2)
+    """
+
+    joints: list[int]
+    driven: list[int]
+    followers: Followers
+    limits: FloatArray
 
 
 class ModelSurvey:
@@ -78,7 +120,11 @@ class ModelSurvey:
         path: of the file
         inertias: made from shapes for those missing or wrong in a URDF
         dropped_meshes: of a URDF, missing or unreadable
+        left_out: links and meshes of a URDF's shapes that are left out, by reason
         speed_limits: of a URDF [rad/s or m/s]
+        locked: values of joints with equal limits, and of those coupled to them [rad or m]; taken out of the model
+        crossed: limits of joints in whose file the lower is above the upper one, in order [rad or m]
+        angle_unit: of the file's hinges [rad]
         model, data: of MuJoCo, at the model's initial joint values
     """
 
@@ -86,34 +132,81 @@ class ModelSurvey:
         """Read and compile a file.
 
         Raises:
-            ValueError: a missing file, no MJCF or URDF, or a file that MuJoCo refuses.
+            ValueError: a missing file, no MJCF or URDF, a file that MuJoCo refuses, a size of no arm.
         """
         self.path = path
         root = read_xml(path)
         self.is_urdf = root.tag == "robot"
         self.inertias: tuple[LinkInertia, ...] = ()
         self.dropped_meshes: tuple[str, ...] = ()
+        self.left_out: dict[str, list[str]] = {}
+        self.locked: dict[str, float] = {}
+        self.crossed: dict[str, tuple[float, float]] = {}
         self.speed_limits: dict[str, float] = {}
         if self.is_urdf:
-            folder = (root.find("mujoco/compiler") or {}).get("meshdir", "")
-            files = {name: find_mesh(path, name, folder) for name in mesh_names(root)}
-            self.dropped_meshes = tuple(
-                name for name, file in files.items() if file is None or file.suffix.lower() not in MESH_FORMATS
-            )
+            dropped, self.left_out = shape_faults(root, path)
+            self.dropped_meshes = tuple(dropped)
             self.speed_limits = speed_limits(root)
             faults = faulty_links(root)
             ball = [LinkInertia(name, 1.0, (0.0, 0.0, 0.0), (1e-3, 1e-3, 1e-3)) for name in faults]
             self._compile(ball)
             self.inertias = tuple(self._solid_link(name, *faults[name]) for name in faults)
         self._compile(self.inertias)
+        self.locked, self.crossed = self._locked(), self._crossed()
+        if self.locked:
+            self._compile(self.inertias)
+        for name, limits in self.crossed.items():
+            self.model.joint(name).range, self.model.joint(name).limited = limits, 1
+        self._check_sizes()
 
     def _compile(self, inertias: Sequence[LinkInertia]) -> None:
         try:
-            self.model = read_model(self.path, inertias, self.dropped_meshes).compile()
+            with warned(f"arm {self.path.stem!r}"):
+                spec = read_model(self.path, inertias, self.dropped_meshes)
+                self.angle_unit = math.radians(1.0) if spec.compiler.degree else 1.0
+                hold_joints(spec, self.locked)
+                self.model = spec.compile()
         except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
             raise ValueError(f"model file {self.path}: {' '.join(str(error).split())}") from None
         self.data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, self.data)
+
+    def _ignored_limits(self) -> Iterator[tuple[int, float, float]]:
+        """Joints whose limits MuJoCo ignores, and these [rad or m]; it leaves them in the file's unit."""
+        for joint in np.flatnonzero(self.model.jnt_limited == 0):
+            unit = self.angle_unit if self.model.jnt_type[joint] == HINGE else 1.0
+            lower, upper = unit * self.model.jnt_range[joint]
+            yield int(joint), float(lower), float(upper)
+
+    def _crossed(self) -> dict[str, tuple[float, float]]:
+        return {self.model.joint(joint).name: (high, low) for joint, low, high in self._ignored_limits() if low > high}
+
+    def _locked(self) -> dict[str, float]:
+        """Joints with equal limits, of which 0 and 0 state none, and those that follow them."""
+        model = self.model
+        values = {joint: low for joint, low, high in self._ignored_limits() if low == high != 0.0}
+        for joint in range(model.njnt if values else 0):
+            couplings = couplings_to_root(model, joint)
+            if couplings and couplings[-1].leader in values:
+                values.setdefault(joint, coupled_value(model, couplings, values[couplings[-1].leader]))
+        return {model.joint(joint).name: value for joint, value in values.items()}
+
+    def _check_sizes(self) -> None:
+        model = self.model
+        for body in range(1, model.nbody):
+            where = f"model file {self.path}: link {self.body_name(body)}"
+            parent, away = int(model.body_parentid[body]), float(norm(model.body_pos[body]))
+            if parent and away > LENGTH_MOST:
+                raise ValueError(f"{where} is {away:.3g} m away from {self.body_name(parent)}: is that in mm?")
+            for geom in self.body_geoms(body):
+                points = self.geom_points(geom)
+                if not len(points):
+                    continue
+                length = float(np.ptp(points, axis=0).max())
+                if length > LENGTH_MOST:
+                    raise ValueError(f"{where} is {length:.3g} m long: scale 0.001 missing?")
+                if model.geom_type[geom] == MESH and length < MESH_LEAST:
+                    raise ValueError(f"{where} has a mesh only {length:.1g} m long: scale 0.001 applied twice?")
 
     def _solid_link(self, name: str, mass: float, centre: FloatArray) -> LinkInertia:
         """Mass and moments of a solid block around a link's shapes, or of a cube for a link without one."""
@@ -148,22 +241,48 @@ class ModelSurvey:
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return list(range(first, first + count))
 
-    def chain(self, body: int) -> list[int]:
+    def chain(self, body: int) -> Chain:
         """Joints from the base to a body.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is none, or a coupling that an arm may not have.
         """
         joints = self._joints_to(body)
         if not joints:
             raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
-        return joints
+        driven = self._driven(joints)
+        own = np.array([self.range_of(joint, np.inf) for joint in driven])
+        with self._named():
+            followers = followers_of(self.model, driven, [*joints, *sorted(self.leaders(joints))])
+            return Chain(joints, driven, followers, narrowed_limits(self.model, driven, followers, own))
+
+    def leaders(self, joints: Sequence[int]) -> set[int]:
+        """Joints beside a chain that its joints follow."""
+        couplings = [coupling for joint in joints for coupling in couplings_to_root(self.model, joint)]
+        return {coupling.leader for coupling in couplings}.difference(joints, [-1])
+
+    def _driven(self, joints: Sequence[int]) -> list[int]:
+        """Joints to be driven: of those with one root, the root or else the first."""
+        driven: dict[int, int] = {}
+        with self._named():
+            for joint in joints:
+                root, slope, _ = joint_value(self.model, joint)
+                if slope != 0.0 and (joint == root or root not in driven):
+                    driven[root] = joint
+        return sorted(driven.values(), key=joints.index)
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"model file {self.path}: {error}") from None
 
     def find_tip(self, named: str | None) -> tuple[int, FloatArray | None]:
         """The body of the tip, and the tip's offset in that body [m] (3,) if a frame marks it.
 
-        Without a name it is a frame fixed to the last link of the longest chain of joints, or that link; of a chain
-        that ends in several fingers, their common link.
+        Without a name it is a frame fixed to the last link of the longest chain of driven joints (of equal ones the one
+        with more followers), or that link; of a chain that ends in several fingers, their common link.
 
         Raises:
             ValueError: a name of neither a body nor a site.
@@ -178,15 +297,22 @@ class ModelSurvey:
                 return self._at_site(sites[named])
             known = sorted(name for name in (*bodies, *sites) if name)
             raise ValueError(f"--tip: {self.path.name} has no link or site {named!r}{nearest(named, known)}")
-        counts = [len(self._joints_to(body)) for body in range(model.nbody)]
+        paths = [self._joints_to(body) for body in range(model.nbody)]
+        counts = [(len(self._driven(path)), len(path)) for path in paths]
         deepest = [body for body in range(model.nbody) if counts[body] == max(counts)]
-        if max(counts) == 0:
+        if max(counts) == (0, 0):
             raise ValueError(f"model file {self.path} has no joint: name the model of an arm")
         ends = {self._joints_to(body)[-1] for body in deepest}
         last = int(model.jnt_bodyid[min(ends)])
         if len(ends) > 1:
-            paths = [self.parents(int(model.jnt_bodyid[joint])) for joint in sorted(ends)]
-            last = next(body for body in paths[0] if all(body in path for path in paths))
+            carriers = [self.parents(int(model.jnt_bodyid[joint])) for joint in sorted(ends)]
+            last = next((body for body in carriers[0] if all(body in part for part in carriers)), 0)
+            if not self._joints_to(last):
+                names = ", ".join(self.body_name(path[0]) for path in carriers)
+                raise ValueError(
+                    f"model file {self.path} ends in {len(carriers)} chains of {max(counts)} joints: name the tip of "
+                    f"one, --tip {names}"
+                )
         fixed = [body for body in range(1, model.nbody) if self._fixed_to(body, last)]
         marks = [index for index in range(model.nsite) if int(model.site_bodyid[index]) in fixed]
         marks = [index for index in marks if _has_tip_word(model.site(index).name)]
@@ -214,10 +340,12 @@ class ModelSurvey:
                 return False
         return False
 
-    def place(self, joints: Sequence[int], values: FloatArray) -> None:
-        """Compute the kinematics at values of some joints [rad or m], the others as the model has them."""
+    def place(self, chain: Chain, values: FloatArray) -> None:
+        """Compute the kinematics at values of a chain's driven joints [rad or m], others as the model has them."""
+        place = self.model.jnt_qposadr
         self.data.qpos[:] = self.model.qpos0
-        self.data.qpos[self.model.jnt_qposadr[list(joints)]] = values
+        self.data.qpos[place[chain.driven]] = values
+        self.data.qpos[place[chain.followers.joints]] = chain.followers.values(values)
         mujoco.mj_kinematics(self.model, self.data)
 
     def range_of(self, joint: int, unlimited: float) -> tuple[float, float]:
@@ -272,51 +400,69 @@ class ModelSurvey:
 
     # ---- remote centre ---------------------------------------------------------------------------------------
 
-    def remote_centre(self, chain: Sequence[int], tip: int, offset: FloatArray) -> RemoteCentre | None:
-        """The common point of the first hinges' axes in all poses, on the line of the shaft's slide."""
+    def remote_centre(self, chain: Chain, tip: int, offset: FloatArray) -> RemoteCentre | None:
+        """The point that the line of a shaft's slide passes in all poses, within CENTRE_TOLERANCE.
+
+        In the frame of the shaft's link (position x, rotation R) the line passes through c along a. The point p and c
+        are the least-squares solution of (I - R a a^T R^T) (p - x - R c) = 0 over 2^POSES_POWER poses. They are a
+        single one if at least two driven joints turn the shaft.
+        """
+        from scipy.stats.qmc import Sobol
+
         model = self.model
-        slides = [index for index, joint in enumerate(chain) if model.jnt_type[joint] == SLIDE]
-        if not slides or slides[0] < 2 or not model.jnt_limited[chain[slides[0]]]:
+        slides = [index for index, joint in enumerate(chain.joints) if model.jnt_type[joint] == SLIDE]
+        if not slides:
             return None
-        before, slide = chain[: slides[0]], chain[slides[0]]
-        body = int(model.jnt_bodyid[slide])
-        rng, poses = np.random.default_rng(0), []
-        for _ in range(3):
-            ranges = np.array([self.range_of(joint, np.pi) for joint in chain])
-            self.place(chain, ranges[:, 0] + rng.random(len(chain)) * np.ptp(ranges, axis=1))
-            point = meeting_point(self.data.xanchor[before], self.data.xaxis[before])
-            if point is None:
-                return None
-            body = self._shaft_body(chain, slides[0])
-            rotation = self.data.xmat[body].reshape(3, 3)
-            axis = matmul(rotation.T, self.data.xaxis[slide])
-            # The line's point nearest to the body's origin; the insertion does not move it.
-            local = matmul(rotation.T, point - self.data.xpos[body])
-            poses.append((point, local - matmul(local, axis) * axis, axis))
-        first = poses[0]
-        if any(np.abs(np.array(pose) - np.array(first)).max() > MEETING_TOLERANCE for pose in poses):
+        driven, limits, slide = chain.driven, chain.limits, chain.joints[slides[0]]
+        roots = [joint_value(model, joint).root for joint in driven]
+        moving = [joint_value(model, joint) for joint in chain.joints[: slides[0] + 1]]
+        *turning, inserting = (roots.index(value.root) if value.slope != 0.0 else -1 for value in moving)
+        if inserting < 0 or not np.isfinite(limits[inserting]).all():
             return None
-        point, local, axis = first
-        low, high = self.range_of(slide, 0.0)
-        reach = []
-        for value in (low, high):
-            self.place([slide], np.array([value]))
+        lower, upper = np.where(np.isfinite(limits), limits, [-np.pi, np.pi]).T
+        self.place(chain, 0.5 * (lower + upper))
+        body = self._shaft_body(chain.joints, slides[0])
+        rows, right = [], []
+        for share in Sobol(len(driven), scramble=False).random_base2(POSES_POWER):
+            self.place(chain, lower + share * (upper - lower))
+            axis = self.data.xaxis[slide]
+            across = np.eye(3) - axis[:, None] * axis
+            rows.append(np.hstack([across, -matmul(across, self.data.xmat[body].reshape(3, 3))]))
+            right.append(matmul(across, self.data.xpos[body]))
+        # c is free along a. Another free direction is that of an axis about which alone the shaft turns.
+        if svd(np.vstack(rows))[1][-2] < 1e-2:
+            return None
+        solution = lstsq(np.vstack(rows), np.concatenate(right))
+        missed = float(norm(matmul(np.array(rows), solution) - right, axis=1).max())
+        if missed > CENTRE_TOLERANCE:
+            return None
+        point, on_line = np.split(solution, 2)
+        axis, reach = matmul(self.data.xmat[body].reshape(3, 3).T, self.data.xaxis[slide]), []
+        for end in limits[inserting]:
+            joints = np.clip(model.qpos0[model.jnt_qposadr[driven]], lower, upper)
+            joints[inserting] = end
+            self.place(chain, joints)
             along = matmul(self.data.xmat[body].reshape(3, 3), axis)
             tip_now = self.data.xpos[tip] + matmul(self.data.xmat[tip].reshape(3, 3), offset)
             reach.append(float(matmul(tip_now - point, along)))
-        sign = np.sign(max(reach, key=abs))
-        return RemoteCentre(point, body, local, sign * axis, slide)
+        sign = float(np.sign(max(reach, key=abs)))
+        least, most = sorted(sign * value for value in reach)
+        turning = frozenset(turning) - {inserting, -1}
+        shaft_point = on_line - matmul(on_line, axis) * axis
+        return RemoteCentre(point, body, shaft_point, sign * axis, slide, turning, (least, most), missed)
 
     def _shaft_body(self, chain: Sequence[int], slide: int) -> int:
-        """The last body with no motion but turning about the line of a slide, in the current pose."""
+        """The last body with no motion but along the line of a slide and about it, in the current pose."""
         body = int(self.model.jnt_bodyid[chain[slide]])
         axis = self.data.xaxis[chain[slide]]
-        line = self.data.xanchor[chain[slide + 1]] if slide + 1 < len(chain) else None
+        line = None
         for joint in chain[slide + 1 :]:
-            turned = norm(np.cross(self.data.xaxis[joint], axis))
-            aside = norm(np.cross(self.data.xanchor[joint] - line, axis))
-            if self.model.jnt_type[joint] != HINGE or turned > 1e-6 or aside > MEETING_TOLERANCE:
+            if norm(np.cross(self.data.xaxis[joint], axis)) > 1e-6:
                 break
+            if self.model.jnt_type[joint] == HINGE:
+                line = self.data.xanchor[joint] if line is None else line
+                if norm(np.cross(self.data.xanchor[joint] - line, axis)) > MEETING_TOLERANCE:
+                    break
             body = int(self.model.jnt_bodyid[joint])
         return body
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from msdm_core.arithmetic import eigh
 from msdm_core.mesh import FloatArray
+from surgsim_env.instruments import MOMENTS
 
 # Smallest mass [kg] and moments [kg m^2] of moving bodies in MuJoCo (mjMINVAL).
 INERTIA_LEAST = 1e-15
@@ -15,7 +16,7 @@ def faulty_links(root: ElementTree.Element) -> dict[str, tuple[float, FloatArray
     """Links refused by MuJoCo, with their stated mass [kg], 0 for none, and centre of mass [m] (3,).
 
     A link moved by a joint needs a mass and a positive definite inertia; another link needs zero moments or those of a
-    body.
+    body. MuJoCo needs all of mass and moments, or none.
     """
     moved = {
         joint.find("child").get("link", "")  # type: ignore[union-attr]
@@ -31,17 +32,23 @@ def faulty_links(root: ElementTree.Element) -> dict[str, tuple[float, FloatArray
             continue
         mass, centre, matrix = _inertial(inertial)
         least = float(eigh(matrix)[0][0]) if np.isfinite(matrix).all() else -1.0
-        wrong = least < 0.0 or (matrix.any() and not mass > INERTIA_LEAST)
-        if wrong or (name in moved and not (mass > INERTIA_LEAST and least > INERTIA_LEAST)):
-            faulty[name] = (mass if mass > INERTIA_LEAST else 0.0, centre)
+        massive = INERTIA_LEAST < mass < np.inf
+        wrong = least < 0.0 or not (massive or (mass == 0.0 and not matrix.any())) or not _is_complete(inertial)
+        if wrong or (name in moved and not (massive and least > INERTIA_LEAST)):
+            faulty[name] = (mass if massive else 0.0, centre)
     return faulty
+
+
+def _is_complete(inertial: ElementTree.Element) -> bool:
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    return mass is not None and "value" in mass.attrib and inertia is not None and inertia.attrib.keys() >= set(MOMENTS)
 
 
 def _inertial(element: ElementTree.Element) -> tuple[float, FloatArray, FloatArray]:
     """Stated mass [kg], centre [m] (3,) and matrix of inertia [kg m^2] (3, 3); 0 if not stated."""
     mass, origin, inertia = element.find("mass"), element.find("origin"), element.find("inertia")
     stated = {} if inertia is None else inertia.attrib
-    xx, xy, xz, yy, yz, zz = (float(stated.get(f"i{pair}", 0.0)) for pair in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    xx, xy, xz, yy, yz, zz = (float(stated.get(name, 0.0)) for name in MOMENTS)
     centre = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
     value = 0.0 if mass is None else float(mass.get("value", 0.0))
     return (

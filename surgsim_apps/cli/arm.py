@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+import subprocess
+import sys
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -51,8 +55,8 @@ COMMENTS = {
     "control.damping": "[N m s/rad, N s/m] critical",
     "control.effort": "[N m, N] largest torque or force",
     "control.armature": "[kg m^2, kg] rotor inertia, of the model or chosen for that stiffness",
-    "home": "[rad, m] the tip 10 cm past the trocar",
-    "limits": "[rad, m] of joints for which the model states none",
+    "home": "[rad, m] the shaft in the trocar, the tip past it",
+    "limits": "[rad, m] of joints for which the model states none, or which joints that follow them narrow",
     "held": "[rad, m] joints that do not move the tip, fixed at these values",
     "shapes": "sphere or capsule that the model lacks",
     "shapes.body": "link that carries it",
@@ -68,7 +72,7 @@ COMMENTS = {
 
 @dataclass(frozen=True)
 class Arm:
-    """Make a palpating arm from an MJCF or URDF file: `surgsim arm check FILE`.
+    """Make a palpating arm from an MJCF or URDF file: `surgsim arm check FILE`, or robot_descriptions:NAME.
 
     Finds the chain of joints, the tip, the shaft, a trocar and a home; finds meshes, replaces missing inertias, adds
     contact shapes. Writes NAME.toml, with a comment on every entry, and NAME.png. See docs/arms.md.
@@ -77,7 +81,7 @@ class Arm:
     action: tyro.conf.Positional[Literal["check"]]
     """The action."""
     file: tyro.conf.Positional[AnyPath]
-    """MJCF or URDF file of the arm."""
+    """MJCF or URDF file of the arm, or robot_descriptions:NAME, a model of the package robot_descriptions."""
     tip: MaybeText = None
     """Link or site of the tip, or of the tool's mount; default: the end of the longest chain of joints."""
     trocar: MaybeText = None
@@ -85,7 +89,7 @@ class Arm:
     tool: MaybeLength = None
     """Mount a straight palpator of this length, even beside a shaft; default: 400mm on arms without a shaft."""
     out: MaybePath = None
-    """Folder for the results; default: that of the file."""
+    """Folder for the results; default: that of the file, for robot_descriptions the current folder."""
 
     def run(self, console: Console) -> int:
         """Make the arm, print findings and choices, write its TOML file and a picture; 1 if it reaches little.
@@ -97,18 +101,20 @@ class Arm:
         from surgsim_env.instruments import load_arm
         from surgsim_env.scene import as_toml, require_number
 
-        if self.file.suffix.lower() == ".xacro":
-            raise ValueError(f"{self.file} is a xacro file: expand it (xacro {self.file.name} > arm.urdf), check that")
         if self.tool is not None:
             require_number("--tool", self.tool, 0.05, "m")
             require_length("--tool", self.tool, TOOL_LONGEST, "an instrument")
-        folder, stem = self.out or self.file.parent, self.file.stem
+        scheme, _, stem = str(self.file).partition(":")
+        if scheme == "robot_descriptions":
+            file, folder = _public_model(stem, console), self.out or Path()
+        else:
+            file, folder, stem = self.file, self.out or self.file.parent, self.file.stem
         names = f"{stem}.toml", f"{stem}.png"
         if (folder / names[0]).exists():
             raise ValueError(f"{folder / names[0]} is there already: remove it, or give another --out")
         with StepProgress(console) as progress, progress.step("looking for a home"):
             arm_model = find_arm(
-                self.file,
+                file,
                 tip=self.tip,
                 trocar=vector_of("--trocar", self.trocar, are_lengths=True),
                 tool_length=self.tool,
@@ -117,10 +123,10 @@ class Arm:
             console.print(f"found: {sentence}", highlight=False, soft_wrap=True)
         for sentence in arm_model.chosen:
             console.print(f"warning: {sentence}", highlight=False, soft_wrap=True, style="yellow")
-        model = os.path.relpath(self.file.resolve(), folder.resolve())
+        model = os.path.relpath(file.resolve(), folder.resolve())
         description = replace(arm_model.description, model=Path(model).as_posix())
         head = (
-            f"Written by `surgsim arm check` from {self.file.name}; docs/arms.md explains every entry.",
+            f"Written by `surgsim arm check` from {file.name}; docs/arms.md explains every entry.",
             *(f"Found: {sentence}." for sentence in arm_model.notes),
             *(f"Chosen: {sentence}." for sentence in arm_model.chosen),
         )
@@ -143,6 +149,31 @@ class Arm:
             soft_wrap=True,
         )
         return 0
+
+
+def _public_model(name: str, console: Console) -> Path:
+    """Model file of the package robot_descriptions, downloaded and expanded by its own command.
+
+    Raises:
+        ValueError: no such package or name, a download that fails.
+    """
+    from surgsim_env.scene import nearest
+
+    try:
+        known = list(import_module("robot_descriptions").DESCRIPTIONS)
+    except ImportError:
+        raise ValueError("robot_descriptions is not installed: pip install robot_descriptions xacrodoc") from None
+    if name not in known:
+        raise ValueError(f"robot_descriptions has no model {name!r}{nearest(name, known)}")
+    with StepProgress(console) as progress, progress.step(f"downloading {name}"):
+        command = [sys.executable, "-m", "robot_descriptions", "pull", name]
+        pulled = subprocess.run(command, capture_output=True, text=True, check=False)
+    if pulled.returncode != 0:
+        # The exception at the end of a traceback, without progress bars.
+        ended = re.split(r"^(?=[\w.]+Error)", pulled.stderr, flags=re.MULTILINE)[-1]
+        reason = " ".join(line for line in ended.splitlines() if "it/s" not in line)
+        raise ValueError(f"robot_descriptions could not give {name}: {reason}")
+    return Path(pulled.stdout.splitlines()[-1])
 
 
 def _draw(arm: ArmKinematics, path: Path, console: Console) -> bool:

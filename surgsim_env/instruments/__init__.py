@@ -3,19 +3,28 @@
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.instruments.arm.arm_instrument import ArmInstrument, check_port_outside, parked_place
 from surgsim_env.instruments.arm.inverse_kinematics import PoseSolution, solve_pose
-from surgsim_env.instruments.arm.model import compile_arm, position_actuator, read_model, read_xml
+from surgsim_env.instruments.arm.model import compile_arm, hold_joints, position_actuator, read_model, read_xml, warned
 from surgsim_env.instruments.arm.pair import SIDES, Pair
 from surgsim_env.instruments.arm.steering import SteeredArm
-from surgsim_env.instruments.arm.urdf import MESH_FORMATS, find_mesh, mesh_names
+from surgsim_env.instruments.arm.urdf import MOMENTS, shape_faults
 from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.joint_couplings import (
+    Followers,
+    coupled_value,
+    couplings_to_root,
+    followers_of,
+    joint_value,
+    narrowed_limits,
+)
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
 
 __all__ = [
     "CONTACT_GROUP",
-    "MESH_FORMATS",
+    "MOMENTS",
     "SIDES",
     "Arm",
     "ArmInstrument",
+    "Followers",
     "Instrument",
     "Pair",
     "PoseSolution",
@@ -23,12 +32,18 @@ __all__ = [
     "ToolBodies",
     "check_port_outside",
     "compile_arm",
-    "find_mesh",
+    "coupled_value",
+    "couplings_to_root",
+    "followers_of",
+    "hold_joints",
+    "joint_value",
     "load_arm",
-    "mesh_names",
+    "narrowed_limits",
     "parked_place",
     "position_actuator",
     "read_model",
     "read_xml",
+    "shape_faults",
     "solve_pose",
+    "warned",
 ]

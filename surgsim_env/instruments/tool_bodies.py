@@ -14,6 +14,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.stepping import round_shapes, unyielding
 from msdm_core.organ.support import Support
 from surgsim_env.instruments import tool_kernels
+from surgsim_env.instruments.joint_couplings import joint_couplings
 from surgsim_env.instruments.tool_kernels import Servo, ToolViews
 
 IndexArray = NDArray[np.int64]
@@ -70,6 +71,18 @@ def _implicit_damping(model: mujoco.MjModel) -> FloatArray:
     return damping
 
 
+def _coupling_inertia(model: mujoco.MjModel) -> FloatArray:
+    """Inertia against motion apart of coupled joints, 1e6 times their own: they move as one, (nv, nv)."""
+    inertia = np.zeros((model.nv, model.nv))
+    for follower, leader, terms in joint_couplings(model):
+        apart = np.zeros(model.nv)
+        apart[model.jnt_dofadr[follower]] = 1.0
+        if leader >= 0:
+            apart[model.jnt_dofadr[leader]] = -terms[1]
+        inertia += 1e6 * model.dof_M0[apart != 0.0].max() * np.outer(apart, apart)
+    return inertia
+
+
 class ToolBodies:
     """Tools of a MuJoCo model: the bodies with contact shapes.
 
@@ -109,7 +122,8 @@ class ToolBodies:
         self._jacobians = np.zeros((count, 6, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
         self._yielded = np.zeros((model.nv, 6))
-        self._implicit_damping = _implicit_damping(model)
+        self._coupling_inertia = _coupling_inertia(model)
+        self._implicit_damping = _implicit_damping(model) + self._coupling_inertia / model.opt.timestep
 
     @property
     def tool_count(self) -> int:
@@ -134,11 +148,12 @@ class ToolBodies:
         tool_kernels.read_response(self.views(), self.response)
 
     def damped_inertia(self, dt: float) -> FloatArray:
-        """M + dt D: joint-space inertia with armature, and the joints' damping over dt [s], shape (nv, nv).
+        """M + dt D: joint-space inertia with armature and couplings, and the joints' damping over dt [s], (nv, nv).
 
         Overwritten by the next call.
         """
         tool_kernels.read_inertia(self.views(), dt)
+        self._inertia += self._coupling_inertia
         return self._inertia
 
     def jacobian(self, tool: int) -> FloatArray:

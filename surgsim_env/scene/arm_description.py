@@ -139,7 +139,7 @@ class ArmDescription:
         folder: of that file; `model` is relative to it.
         model: MJCF or URDF file.
         kind: "palpator" or "grasper".
-        joints: the driven joints, from base to tip.
+        joints: the driven joints, from base to tip; joints that follow them by the model's couplings are not named.
         contact: geoms in contact with tissue (spheres and capsules).
         links: other geoms of the arm (spheres and capsules), for clearances only.
         tip, trocar, control: see there.

@@ -197,6 +197,22 @@ def test_what_is_coupled_to_a_driven_joint_is_held_where_it_is_at_home(scope, le
     assert {load_arm(description).model.joint(index).name for index in range(5)} == set(description.joints)
 
 
+@pytest.mark.parametrize(
+    ("open_1", "mimic", "values"),
+    [
+        ("-1", '<mimic joint="open_1" offset="0.3"/>', (0.0, 0.3)),
+        ("0.2", '<mimic joint="open_1" multiplier="-2" offset="0.1"/>', (0.2, -0.3)),
+    ],
+)
+def test_held_joints_keep_their_couplings(scope, open_1, mimic, values):
+    text = URDF.replace('<mimic joint="open_1" multiplier="-1"/>', mimic)
+    first, second = text.split('<joint name="open_1"')
+    second = second.replace('lower="-1"', f'lower="{open_1}"', 1)
+    scope.write_text(f'{first}<joint name="open_1"{second}')
+    held = find_arm(scope).description.held
+    assert (held["open_1"], held["open_2"]) == pytest.approx(values, abs=1e-9)
+
+
 def test_its_file_reads_back_equal(scope):
     description = find_arm(scope).description
     path = scope.parent / "scope.toml"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from msdm_core.arithmetic import dot, eigh, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.support import Support
-from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm
+from surgsim_env.instruments.arm.model import LINK_GROUP, TIP_SITE, compile_arm, followers_in
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP
 from surgsim_env.scene.arm_description import ArmDescription, read_description
 from surgsim_env.scene.model import Port
@@ -33,6 +33,7 @@ class Arm:
         model: MuJoCo's model of the arm alone
         joints: names of the driven joints, base to tip
         qpos, dof: their indices in MuJoCo's coordinates and velocities          (n,)
+        followers: joints that follow them
         lower, upper: limits [rad or m]                                          (n,)
         speed_limit: [rad/s or m/s]                                              (n,)
         home: [rad or m]                                                         (n,)
@@ -52,6 +53,9 @@ class Arm:
         self.joints = description.joints
         index = [model.joint(name).id for name in self.joints]
         self.qpos, self.dof = model.jnt_qposadr[index], model.jnt_dofadr[index]
+        self.followers = followers_in(model, description)
+        self._follower_qpos = model.jnt_qposadr[self.followers.joints]
+        self._follower_dof = model.jnt_dofadr[self.followers.joints]
         self.lower, self.upper = model.jnt_range[index, 0].copy(), model.jnt_range[index, 1].copy()
         self.speed_limit = np.array(description.control.speed_limit)
         self.home = np.array([description.home[name] for name in self.joints])
@@ -84,6 +88,11 @@ class Arm:
         """True if the mechanism itself keeps the shaft in the trocar."""
         return self.description.trocar.fixed
 
+    @property
+    def trocar_play(self) -> float:
+        """Distance from the trocar at which the mechanism itself may keep the shaft [m]; 0 if control keeps it."""
+        return self.description.trocar.tolerance if self.remote_centre_fixed else 0.0
+
     def tip_pose(self, joints: ArrayLike) -> Pose:
         """Pose of the tip at joint values (n,), in the frame of the description's site or body."""
         data = self._at(joints)
@@ -97,7 +106,7 @@ class Arm:
         """Jacobian of the tip's velocity [m/s] and angular velocity [rad/s], world frame, (6, n)."""
         data = self._at(joints, moving=True)
         mujoco.mj_jacSite(self.model, data, self._jacobian[:3], self._jacobian[3:], self.tip_site)
-        return self._jacobian[:, self.dof]
+        return self.driven_columns(self._jacobian)
 
     def shaft_line(self, joints: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Point of the shaft's axis nearest to the trocar [m] and its direction to the tip, each (3,)."""
@@ -116,7 +125,15 @@ class Arm:
         data = self._at(joints, moving=True)
         mujoco.mj_jac(self.model, data, self._jacobian[:3], None, near, self.shaft)
         across = np.stack(tangent_axes(along))
-        return matmul(across, self.trocar - near), matmul(across, self._jacobian[:3, self.dof])
+        return matmul(across, self.trocar - near), matmul(across, self.driven_columns(self._jacobian[:3]))
+
+    def driven_columns(self, matrix: FloatArray) -> FloatArray:
+        """Columns of the driven joints (m, n), with their followers', of a matrix for all velocities (m, nv)."""
+        columns = matrix[:, self.dof]
+        followers = self.followers
+        for dof, driver, slope in zip(self._follower_dof, followers.driver, followers.slope, strict=True):
+            columns[:, driver] += slope * matrix[:, dof]
+        return columns
 
     def shape_ends(self, joints: ArrayLike, jaw: float = 0.0) -> FloatArray:
         """Ends of the outer shapes' axes at joint values (n,) and a jaw angle [rad], shape (n_shape, 2, 3) [m]."""
@@ -132,8 +149,9 @@ class Arm:
         return float(np.sqrt(np.prod(np.maximum(eigh(matmul(linear, linear.T))[0], 0.0))))
 
     def write(self, data: mujoco.MjData, joints: ArrayLike, jaw: float = 0.0) -> None:
-        """Write joint values (n,) and a jaw angle [rad], shared by its fingers, into MuJoCo's coordinates."""
+        """Write joint values (n,), their followers' and a jaw angle [rad], shared by its fingers, into `data.qpos`."""
         data.qpos[self.qpos] = joints
+        data.qpos[self._follower_qpos] = self.followers.values(data.qpos[self.qpos])
         for name in self.description.jaw:
             data.qpos[self.model.joint(name).qposadr[0]] = jaw / len(self.description.jaw)
 

@@ -79,7 +79,6 @@ class ArmInstrument(SteeredArms):
         super().__init__(model, lower, upper, arm.tip_site)
         count = arm.joint_count
         self.servo = joint_servo(model, (*arm.joints, *arm.description.jaw))
-        self.servo.lower[:count], self.servo.upper[:count] = arm.lower, arm.upper
         if arm.description.jaw:
             self._set_jaw(Jaw(self, arm.description.jaw, count + np.arange(len(arm.description.jaw))))
         self.steered = SteeredArm(

@@ -47,7 +47,7 @@ class PoseSolution:
         joints: values [rad or m], (n,).
         position_error: distance of the tip from its target [m].
         angle_error: angle between the tip's direction (or frame) and its target [rad]; 0 without a target.
-        trocar_error: distance of the shaft's axis from the trocar [m].
+        trocar_error: distance of the shaft's axis from the trocar beyond the arm's `trocar_play` [m].
         reached: True if all three are within tolerance.
     """
 
@@ -150,9 +150,8 @@ def _judge(arm: Arm, joints: FloatArray, target: Target) -> PoseSolution:
         angle = float(norm(_turn_between(pose.rotation, target.rotation)))
     elif target.direction is not None:
         angle = float(norm(turn_towards(arm.tip_direction(joints), target.direction)))
-    trocar = arm.trocar_residual(joints)
-    kept = arm.description.trocar.tolerance if arm.remote_centre_fixed else POSITION_TOLERANCE
-    reached = position <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE and trocar <= kept
+    trocar = max(arm.trocar_residual(joints) - arm.trocar_play, 0.0)
+    reached = position <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE and trocar <= POSITION_TOLERANCE
     return PoseSolution(joints, position, angle, trocar, reached)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh_files.mesh_file import checked_content
 from msdm_core.organ.support import Support
-from surgsim_env.instruments.arm.urdf import prepare_urdf
+from surgsim_env.instruments.arm.urdf import check_numbers, import_mesh, prepare_urdf
+from surgsim_env.instruments.joint_couplings import Followers, followers_of, narrowed_limits
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
 from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
 from surgsim_env.scene.load import nearest
@@ -23,6 +24,10 @@ from surgsim_env.scene.model import Port, frame_into
 # Groups of geoms: visual only, and outer links for clearances; geoms of CONTACT_GROUP touch tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
+# Couplings of joints are as rigid as MuJoCo can make them: within two steps, and by all but 1e-4 of their force.
+COUPLING_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+# Joints of a URDF that may follow others and be followed.
+URDF_JOINTS = ("revolute", "continuous", "prismatic")
 # Largest size of a model file [bytes]: chosen, MuJoCo would read a larger one for minutes.
 FILE_SIZE_MOST = 200_000_000
 # Colour of a description's added shapes.
@@ -50,6 +55,7 @@ def compile_arm(
             spec = arm_spec(description, port, tip_radius, timestep)
             add_supports(spec, supports, moving=supports_move)
             model = spec.compile()
+            _narrow_limits(model, description)
     except (ValueError, TypeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(f"{where}: {' '.join(str(error).split())}") from None
     _check_joints(model, description, where)
@@ -93,14 +99,21 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
     """
     root = read_xml(path)
     if root.tag == "robot":
-        prepare_urdf(root, path, inertias, dropped_meshes)
+        _check_leaders(root)
+        limits = prepare_urdf(root, path, inertias, dropped_meshes)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         spec.modelfiledir = str(path.parent)
+        for joint, pair in limits.items():
+            spec.joint(joint).range, spec.joint(joint).limited = pair, mujoco.mjtLimited.mjLIMITED_FALSE
     elif inertias or dropped_meshes:
         name = "inertias" if inertias else "dropped_meshes"
         raise ValueError(f"{name} is for URDF files; model file {path} is MJCF: change it there")
     else:
         spec = mujoco.MjSpec.from_file(str(path))
+    for mesh in spec.meshes:
+        file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
+        if file.is_file():
+            import_mesh(mesh, file)
     return spec
 
 
@@ -108,18 +121,35 @@ def read_xml(path: Path) -> ElementTree.Element:
     """Read the root element of a model file.
 
     Raises:
-        ValueError: an unreadable file, one larger than FILE_SIZE_MOST, or one without valid XML.
+        ValueError: an unreadable file, one larger than FILE_SIZE_MOST, one without valid XML, a URDF with text in place
+            of a number.
     """
     checked_content(path)
     try:
         size = path.stat().st_size
         if size > FILE_SIZE_MOST:
             raise ValueError(f"model file {path} has {size} bytes; at most {FILE_SIZE_MOST} are read: reduce it")
-        return ElementTree.fromstring(path.read_bytes())
+        root = ElementTree.fromstring(path.read_bytes())
     except OSError as error:
         raise ValueError(f"model file {path} cannot be read: {error.strerror}") from None
     except ElementTree.ParseError as error:
         raise ValueError(f"model file {path} is not valid XML: {error}") from None
+    if root.tag == "robot":
+        check_numbers(root, path)
+    return root
+
+
+def _check_leaders(root: ElementTree.Element) -> None:
+    """Check that the joints of a URDF follow joints that move: MuJoCo leaves out other couplings."""
+    moving = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") in URDF_JOINTS}
+    for joint in root.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None and joint.get("name") in moving and mimic.get("joint") not in moving:
+            leader = mimic.get("joint", "")
+            raise ValueError(
+                f"joint {joint.get('name')!r} follows {leader!r} by <mimic>, which is no joint that moves"
+                f"{nearest(leader, sorted(moving))}: name one there, or take the <mimic> out"
+            )
 
 
 def _check_parts(spec: mujoco.MjSpec, description: ArmDescription) -> None:
@@ -187,6 +217,18 @@ def _set_up(spec: mujoco.MjSpec, arm: ArmDescription, port: Port, tip_radius: fl
         if joint is not None:  # None for a held joint
             joint.range = np.array(limits) / _angle_unit(spec, joint)
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+    # Keyframes give a value for each joint and actuator of the file.
+    for key in list(spec.keys):
+        spec.delete(key)
+    coupled: set[str] = set()
+    for equality in spec.equalities:
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT:
+            equality.solref, equality.solimp = (2.0 * timestep, 1.0), COUPLING_SOLIMP
+            coupled |= {equality.name1, equality.name2}
+    # What follows a driven joint has no drive of its own.
+    for actuator in list(spec.actuators):
+        if actuator.target in coupled.difference(arm.joints, arm.jaw):
+            spec.delete(actuator)
     if arm.control.mode == "servo":
         _add_servos(spec, arm)
     _place(spec, arm, port)
@@ -261,9 +303,6 @@ def _add_servos(spec: mujoco.MjSpec, arm: ArmDescription) -> None:
     for actuator in list(spec.actuators):
         if actuator.target in arm.joints:
             spec.delete(actuator)
-    # Keyframes give a control for each actuator of the file.
-    for key in list(spec.keys):
-        spec.delete(key)
     for index, name in enumerate(arm.joints):
         joint, effort = spec.joint(name), control.effort[index]
         if control.armature:
@@ -292,6 +331,23 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
     frame = world.add_frame(pos=np.array(port.point) - matmul(rotation, np.array(trocar.point)), quat=quaternion)
     for part in rooted:
         part.set_frame(frame)
+
+
+def _narrow_limits(model: mujoco.MjModel, arm: ArmDescription) -> None:
+    """Narrow the limits of driven joints to those of the joints that follow them."""
+    driven = [model.joint(name).id for name in arm.joints]
+    limited = model.jnt_limited[driven].astype(bool)[:, None]
+    own = np.where(limited, model.jnt_range[driven], [-np.inf, np.inf])
+    narrow = narrowed_limits(model, driven, followers_in(model, arm), own)
+    for joint, limits in zip(driven, narrow, strict=True):
+        if np.isfinite(limits).all():
+            model.jnt_limited[joint], model.jnt_range[joint] = 1, limits
+
+
+def followers_in(model: mujoco.MjModel, arm: ArmDescription) -> Followers:
+    """The followers of an arm's driven joints in its compiled model; the fingers of a jaw have drives of their own."""
+    driven, jaw = ([model.joint(name).id for name in names] for names in (arm.joints, arm.jaw))
+    return followers_of(model, driven, [joint for joint in range(model.njnt) if joint not in jaw])
 
 
 def _check_joints(model: mujoco.MjModel, arm: ArmDescription, where: str) -> None:

@@ -69,7 +69,9 @@ class SteeredArm:
         self.arm, self.jaw = arm, jaw
         self.lower, self.upper = instrument.lower, instrument.upper
         self._instrument, self._places, self._control_step = instrument, places, control_step
-        self._qpos = np.array([int(model.joint(prefix + name).qposadr[0]) for name in arm.joints])
+        followers = [arm.model.joint(joint).name for joint in arm.followers.joints]
+        self._qpos = np.array([int(model.joint(prefix + name).qposadr[0]) for name in (*arm.joints, *followers)])
+        instrument.servo.lower[places], instrument.servo.upper[places] = arm.lower, arm.upper
         self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
         self._velocity = np.zeros(6)
         self._starts = [direction / norm(direction)]
@@ -101,7 +103,7 @@ class SteeredArm:
     @property
     def joint_positions(self) -> FloatArray:
         """Values of the driven joints [rad or m], (n,)."""
-        return self._instrument.data.qpos[self._qpos]
+        return self._instrument.data.qpos[self._qpos[: self.arm.joint_count]]
 
     @property
     def trocar_residual(self) -> float:
@@ -131,7 +133,7 @@ class SteeredArm:
             raise ValueError(f"{self.where} cannot put its tip at {millimetres(position)}: {missing(solution)}")
         self.short = False
         data, servo = self._instrument.data, self._instrument.servo
-        data.qpos[self._qpos] = solution.joints
+        data.qpos[self._qpos] = np.append(solution.joints, self.arm.followers.values(solution.joints))
         data.ctrl[servo.position[self._places]] = solution.joints
         servo.command[self._places] = 0.0
         if self.jaw is not None:

@@ -1,27 +1,77 @@
-"""Preparation of URDF files for MuJoCo: paths of meshes, masses and moments of faulty links.
+"""Preparation of URDF files for MuJoCo: numbers, meshes, shapes without extent, masses and moments of faulty links.
 
 URDF files refer to meshes by ROS packages or by folders of another computer, and often state moments of inertia of
 zero, which MuJoCo refuses for moving bodies.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 from xml.etree import ElementTree
 
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh_files import checked_content, parsed
 from surgsim_env.scene.arm_description import LinkInertia
 from surgsim_env.scene.load import nearest
 
-# Keeps visual shapes and each link as a body of its own; file names of meshes are whole paths (`find_mesh`).
-COMPILER = {"discardvisual": "false", "fusestatic": "false", "balanceinertia": "true"}
-# Mesh formats of MuJoCo.
+# Defaults that keep visual shapes; a file's own entries are kept.
+COMPILER = {"discardvisual": "false", "balanceinertia": "true"}
+# Mesh formats of MuJoCo; trimesh reads others.
 MESH_FORMATS = (".stl", ".obj", ".msh")
 # Number of folders above the URDF's to be searched for meshes.
 FOLDERS_ABOVE = 4
+# Sizes of the primitive shapes, and names of moments of inertia.
+SIZES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "sphere": ("radius",),
+}
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# Attributes of links and joints that are numbers, with their count.
+NUMBERS = {"xyz": 3, "rpy": 3, "size": 3, "scale": 3, "rgba": 4}
+NUMBERS |= dict.fromkeys(("radius", "length", "value", "multiplier", "offset", "damping", "friction", *MOMENTS), 1)
+NUMBERS |= dict.fromkeys(("lower", "upper", "effort", "velocity"), 1)
+# Elements whose numbers may be infinite or nan: their shapes are left out, their inertias replaced.
+REPLACED = ("inertia", "mass", *SIZES)
+
+
+def check_numbers(root: ElementTree.Element, path: Path) -> None:
+    """Check that a URDF is no xacro template and has numbers where it needs them.
+
+    Raises:
+        ValueError: names link or joint, attribute and text.
+    """
+    if any("xacro}" in element.tag for element in root.iter()):
+        raise ValueError(f"model file {path} is a xacro template: expand it (xacro {path.name} > arm.urdf), name that")
+    for part in (*root.findall("link"), *root.findall("joint")):
+        for element in part.iter():
+            for name, text in element.attrib.items():
+                where = f"model file {path}: {part.tag} {part.get('name', '')}: {element.tag} {name} is {text!r}"
+                if "${" in text or "$(" in text:
+                    raise ValueError(f"{where}: run xacro first")
+                count = NUMBERS.get(name) if name != "value" or element.tag == "mass" else None
+                if count and not _are_numbers(text, count, element.tag):
+                    raise ValueError(f"{where}; write {count} number{'s with blanks between them' * (count > 1)}")
+
+
+def _are_numbers(text: str, count: int, tag: str) -> bool:
+    """True for as many numbers; those of limits may be infinite."""
+    try:
+        values = [float(value) for value in text.split()]
+    except ValueError:
+        return False
+    bad = math.isnan if tag == "limit" else lambda value: not math.isfinite(value)
+    return len(values) == count and (tag in REPLACED or not any(map(bad, values)))
 
 
 def prepare_urdf(
     root: ElementTree.Element, path: Path, inertias: Sequence[LinkInertia], dropped_meshes: Sequence[str]
-) -> None:
+) -> dict[str, tuple[float, float]]:
     """Change a URDF's elements for MuJoCo.
 
     Args:
@@ -30,57 +80,162 @@ def prepare_urdf(
         inertias: of links, in place of the file's own.
         dropped_meshes: file names in the URDF of meshes to be left out with their shapes.
 
+    Returns:
+        Limits [rad or m] that are equal or cross, taken out: MuJoCo ignores them, with a printed warning.
+
     Raises:
-        ValueError: a missing mesh file, a format unknown to MuJoCo, an unknown link or mesh.
+        ValueError: a missing mesh file, an unknown link or mesh.
     """
-    _drop_meshes(root, path, dropped_meshes)
-    compiler = root.find("mujoco/compiler")
-    if compiler is None:
-        own = root.find("mujoco")
-        own = ElementTree.SubElement(root, "mujoco") if own is None else own
-        compiler = ElementTree.SubElement(own, "compiler", COMPILER)
-    folder = compiler.attrib.pop("meshdir", "")
+    files = mesh_files(root, path)
+    for name in dropped_meshes:
+        if name not in files:
+            raise ValueError(f"dropped_meshes: {path.name} has no mesh {name!r}{nearest(name, list(files))}")
+    for link, shape in _shapes(root):
+        mesh = shape.find("geometry/mesh")
+        if shape_fault(shape) or (mesh is not None and mesh.get("filename", "") in dropped_meshes):
+            link.remove(shape)
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
-        file = find_mesh(path, name, folder)
+        file = files[name]
         if file is None:
-            place = path.parent / folder / PurePosixPath(name).name
             raise ValueError(
-                f"mesh file {place} is missing: put it there, or take the mesh out of {path.name}, or list {name!r} "
-                "in dropped_meshes"
-            )
-        if file.suffix.lower() not in MESH_FORMATS:
-            raise ValueError(
-                f"mesh file {file} is of a format that MuJoCo does not read: convert it to STL or OBJ, or list "
+                f"mesh file {name} is missing: put it beside {path.name}, or take the mesh out of that, or list "
                 f"{name!r} in dropped_meshes"
             )
         mesh.set("filename", str(file.absolute()))
-    compiler.set("strippath", "false")
+    compiler = _child(_child(root, "mujoco"), "compiler")
+    # The file's folders are in the whole paths; each link stays a body of its own.
+    for name in ("meshdir", "assetdir"):
+        compiler.attrib.pop(name, None)
+    compiler.attrib.update({**COMPILER, **compiler.attrib, "fusestatic": "false", "strippath": "false"})
     _set_inertias(root, inertias)
+    return _ignored_limits(root)
 
 
-def mesh_names(root: ElementTree.Element) -> list[str]:
-    """Distinct file names of a URDF's meshes."""
-    return list(dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")))
+def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """The first child of a tag, made if there is none."""
+    child = element.find(tag)
+    return ElementTree.SubElement(element, tag) if child is None else child
 
 
-def find_mesh(path: Path, name: str, folder: str = "") -> Path | None:
+def _shapes(root: ElementTree.Element) -> list[tuple[ElementTree.Element, ElementTree.Element]]:
+    """Links and their visual and collision elements, in pairs."""
+    return [(link, part) for link in root.findall("link") for part in link if part.tag in ("visual", "collision")]
+
+
+def shape_fault(shape: ElementTree.Element) -> str | None:
+    """Reason for leaving out a visual or collision element, whatever its mesh; None for a shape with an extent."""
+    geometry = shape.find("geometry")
+    solid = None if geometry is None else next(iter(geometry), None)
+    if solid is None:
+        return "no geometry"
+    if solid.tag == "mesh":
+        scale = solid.get("scale", "1 1 1")
+        return None if all(map(float, scale.split())) else f"scale {scale!r}"
+    if solid.tag not in SIZES:
+        return f"{solid.tag}: unknown to MuJoCo"
+    sizes = [solid.get(name, "") for name in SIZES[solid.tag]]
+    values = [float(value) for text in sizes for value in text.split()]
+    if all(sizes) and all(0.0 < value < math.inf for value in values):
+        return None
+    return f"{solid.tag} of {', '.join(f'{n} {s!r}' for n, s in zip(SIZES[solid.tag], sizes, strict=True))}"
+
+
+def shape_faults(root: ElementTree.Element, path: Path) -> tuple[list[str], dict[str, list[str]]]:
+    """File names in a URDF of meshes that cannot be read, and links and meshes of shapes to be left out, by reason."""
+    files = mesh_files(root, path)
+    dropped: list[str] = []
+    faults: dict[str, list[str]] = {}
+    for link, shape in _shapes(root):
+        mesh, fault, where = shape.find("geometry/mesh"), shape_fault(shape), link.get("name", "")
+        if mesh is not None:
+            name = mesh.get("filename", "")
+            where = f"{where}: {name}"
+            if not fault:
+                fault = _mesh_fault(files[name], [float(part) for part in mesh.get("scale", "1 1 1").split()])
+                dropped += [name] if fault else []
+        if fault:
+            faults.setdefault(fault, []).append(where)
+    return list(dict.fromkeys(dropped)), {fault: list(dict.fromkeys(places)) for fault, places in faults.items()}
+
+
+def _mesh_fault(file: Path | None, scale: list[float]) -> str | None:
+    """MuJoCo's reason against a mesh, or that of its reader; None for a good one."""
+    if file is None:
+        return "not found"
+    spec = mujoco.MjSpec()
+    try:
+        mesh = spec.add_mesh(name="mesh", file=str(file.absolute()), scale=scale)
+        import_mesh(mesh, file)
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+        spec.compile()
+    except ValueError as error:
+        text = str(error).removeprefix(str(file)).split("\nElement")[0].removeprefix("Error: ").strip(": ")
+        if "coplanar" in text:
+            return "flat"
+        return "without volume: open, or scaled twice" if "too small" in text else " ".join(text.split())
+    return None
+
+
+def import_mesh(mesh: Any, file: Path) -> None:
+    """Give an `MjsMesh` the triangles of a file that MuJoCo does not read itself, such as an STL in letters.
+
+    Raises:
+        ValueError: a stand-in for the file, or none that trimesh reads.
+    """
+    checked_content(file)
+    suffix, size = file.suffix.lower(), file.stat().st_size
+    with file.open("rb") as stream:
+        count = int.from_bytes(stream.read(84)[80:], "little")
+    if suffix in MESH_FORMATS and (suffix != ".stl" or size == 84 + 50 * count):
+        return
+    vertices, triangles = parsed(file, _triangles, "convert it to STL or OBJ")
+    if not len(triangles):
+        raise ValueError(f"{file} has no triangles: export it again")
+    mesh.name = mesh.name or file.stem
+    mesh.file, mesh.uservert, mesh.userface = "", vertices.ravel(), triangles.ravel()
+
+
+def _triangles(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices [m] (n, 3) and triangles (m, 3) of a file, in metres if it states its unit."""
+    import trimesh
+
+    surface: Any = trimesh.load(path, force="mesh")
+    if surface.units is not None:
+        surface.convert_units("meters")
+    return surface.vertices, surface.faces
+
+
+def mesh_files(root: ElementTree.Element, path: Path) -> dict[str, Path | None]:
+    """Paths of a URDF's meshes by their file names in it; None for those that are not found."""
+    compiler = root.find("mujoco/compiler")
+    stated = {} if compiler is None else compiler.attrib
+    folder = stated.get("meshdir", stated.get("assetdir", ""))
+    strip = stated.get("strippath") != "false"
+    names = dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh"))
+    return {name: find_mesh(path, name, folder, strip) for name in names}
+
+
+def find_mesh(path: Path, name: str, folder: str = "", strip: bool = True) -> Path | None:
     """Path of a mesh by its name in a URDF, or None.
 
     Args:
         path: of the URDF.
         name: such as meshes/link.stl, /home/them/link.stl or package://arm/meshes/link.stl.
         folder: of the meshes by the URDF's compiler element.
+        strip: True if that element takes folders off their names, as by default.
     """
-    return next((place for place in _places(path, name, folder) if place.is_file()), None)
+    return next((place for place in _places(path, name, folder, strip) if place.is_file()), None)
 
 
-def _places(path: Path, name: str, folder: str) -> Iterator[Path]:
-    """Candidate paths of a mesh: as named, below folders above the URDF, then by less and less of its path."""
+def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
+    """Candidate paths of a mesh: in its stated folder, as named, by less and less of its path below folders above."""
     scheme, separator, rest = name.rpartition("://")
     parts = PurePosixPath((rest if separator else name).replace("\\", "/")).parts
     if not parts:
         return
+    if folder:
+        yield path.parent / folder / Path(*parts[-1:] if strip else parts)
     if not separator or scheme == "file":
         yield path.parent / Path(*parts)
     above = [path.parent.absolute(), *path.parent.absolute().parents][: FOLDERS_ABOVE + 1]
@@ -91,17 +246,21 @@ def _places(path: Path, name: str, folder: str) -> Iterator[Path]:
     yield from (place / "meshes" / parts[-1] for place in above)
 
 
-def _drop_meshes(root: ElementTree.Element, path: Path, names: Iterable[str]) -> None:
-    known = mesh_names(root)
-    for name in names:
-        if name not in known:
-            raise ValueError(f"dropped_meshes: {path.name} has no mesh {name!r}{nearest(name, known)}")
-    gone = set(names)
-    for link in root.findall("link"):
-        for shape in [part for part in link if part.tag in ("visual", "collision")]:
-            mesh = shape.find("geometry/mesh")
-            if mesh is not None and mesh.get("filename", "") in gone:
-                link.remove(shape)
+def _ignored_limits(root: ElementTree.Element) -> dict[str, tuple[float, float]]:
+    """Take out limits that are equal, cross or are infinite; the first two are returned."""
+    ignored = {}
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        lower, upper = (float(limit.get(name, 0.0)) for name in ("lower", "upper"))
+        endless = math.isinf(lower) or math.isinf(upper)
+        if not endless and lower >= upper:
+            ignored[joint.get("name", "")] = lower, upper
+        if endless or lower >= upper:
+            limit.attrib.pop("lower", None)
+            limit.attrib.pop("upper", None)
+    return ignored
 
 
 def _set_inertias(root: ElementTree.Element, inertias: Sequence[LinkInertia]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from msdm_core.arithmetic import cbrt, cos, dot, eigh, lstsq, matmul, norm, sin, solve, svd
+from msdm_core.arithmetic import cbrt, cos, dot, eigh, lstsq, matmul, norm, power, sin, solve, svd
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
 from surgsim_env.instruments import (
@@ -40,9 +40,9 @@ SHAFT_LENGTH_LEAST, SHAFT_RADIUS_MOST = 0.10, 0.008
 LENGTH_MOST, MESH_LEAST = 5.0, 0.001
 # Largest distance of axes from their meeting point [m].
 MEETING_TOLERANCE = 1e-4
-# A shaft has a remote centre if it passes a point by no more in 2^8 poses [m]: chosen, for the parallelogram of
+# A shaft has a remote centre if it passes a point by no more in so many poses [m]: chosen, for the parallelogram of
 # jhu-dvrk/dvrk_model's da Vinci Si, which leaves it by 4 mm.
-CENTRE_TOLERANCE, POSES_POWER = 5e-3, 8
+CENTRE_TOLERANCE, POSES = 5e-3, 256
 # Words in the names of frames at a tool's tip.
 TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
 # As numbers: a numpy integer equals no member of MuJoCo's enumerations.
@@ -404,11 +404,9 @@ class ModelSurvey:
         """The point that the line of a shaft's slide passes in all poses, within CENTRE_TOLERANCE.
 
         In the frame of the shaft's link (position x, rotation R) the line passes through c along a. The point p and c
-        are the least-squares solution of (I - R a a^T R^T) (p - x - R c) = 0 over 2^POSES_POWER poses. They are a
+        are the least-squares solution of (I - R a a^T R^T) (p - x - R c) = 0 over POSES poses. They are a
         single one if at least two driven joints turn the shaft.
         """
-        from scipy.stats.qmc import Sobol
-
         model = self.model
         slides = [index for index, joint in enumerate(chain.joints) if model.jnt_type[joint] == SLIDE]
         if not slides:
@@ -423,7 +421,9 @@ class ModelSurvey:
         self.place(chain, 0.5 * (lower + upper))
         body = self._shaft_body(chain.joints, slides[0])
         rows, right = [], []
-        for share in Sobol(len(driven), scramble=False).random_base2(POSES_POWER):
+        # Poses spread more evenly than random ones (Niederreiter 1978).
+        advance = power(2.0, np.arange(1, len(driven) + 1) / (len(driven) + 1))
+        for share in (0.5 + np.outer(np.arange(POSES), advance)) % 1.0:
             self.place(chain, lower + share * (upper - lower))
             axis = self.data.xaxis[slide]
             across = np.eye(3) - axis[:, None] * axis

@@ -16,6 +16,7 @@ from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.arm.arm import Arm, load_arm
 from surgsim_env.instruments.arm.inverse_kinematics import reach_pose
+from surgsim_env.instruments.arm.pair import Pair
 from surgsim_env.instruments.joint_couplings import joint_couplings
 from surgsim_env.instruments.tool_bodies import ToolBodies
 from surgsim_env.scene.anatomy import load_anatomy
@@ -279,18 +280,20 @@ def test_couplings_hold_in_a_pair(tmp_path):
     instrument = replace(anatomy.scene.instrument, model=f"psm_retractor+{tmp_path / 'para.toml'}")
     simulation = Simulation(load_anatomy(replace(anatomy.scene, instrument=instrument)))
     simulation.restart(np.stack([LEFT, RIGHT]) + np.array([0.0, 0.03, 0.02]))
-    start = simulation.instrument.arms["right"].tip_position
+    pair = simulation.instrument
+    assert isinstance(pair, Pair)
+    couplings, places = joint_couplings(pair.model), pair.model.jnt_qposadr
+    assert len(couplings) == 2
+    start = pair.arms["right"].tip_position
     for _ in range(5):
-        simulation.instrument.command_velocity(np.array([[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]]))
+        pair.command_velocity(np.array([[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]]))
         simulation.control_step(50)
         assert simulation.end_control_step(), simulation.fault
-        model, values = simulation.instrument.model, simulation.instrument.data.qpos
-        for follower, leader, terms in joint_couplings(model):
-            led = terms[1] * values[model.jnt_qposadr[leader]]
-            assert values[model.jnt_qposadr[follower]] == pytest.approx(led, abs=1e-6)
-    assert len(joint_couplings(model)) == 2
+        for follower, leader, terms in couplings:
+            led = terms[1] * pair.data.qpos[places[leader]]
+            assert pair.data.qpos[places[follower]] == pytest.approx(led, abs=1e-6)
     # 10 mm/s for 0.25 s.
-    np.testing.assert_allclose(simulation.instrument.arms["right"].tip_position - start, [0, 2.5e-3, 0], atol=2e-4)
+    np.testing.assert_allclose(pair.arms["right"].tip_position - start, [0, 2.5e-3, 0], atol=2e-4)
 
 
 # ---- MJCF --------------------------------------------------------------------------------------------------------

@@ -30,8 +30,9 @@ print(sorted(name for name in sys.modules if name.split(".")[0] == "OpenGL" or n
 
 
 def run(code: str, **environment: str) -> str:
-    """Output of a fresh interpreter, without a display."""
-    inherited = {key: value for key, value in os.environ.items() if key not in (*gl.DISPLAYS, gl.VARIABLE)}
+    """Output of a fresh interpreter, without a display, and without what this one chose for its own pictures."""
+    own = (*gl.DISPLAYS, gl.VARIABLE, gl.DEVICE, gl.PLATFORM)
+    inherited = {key: value for key, value in os.environ.items() if key not in own}
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=REPOSITORY,

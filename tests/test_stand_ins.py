@@ -18,7 +18,7 @@ LFS = "version https://git-lfs.github.com/spec/v1\noid sha256:" + "0" * 64 + "\n
 READERS = {
     **dict.fromkeys((".vtu", ".vtk", ".msh", ".mesh"), partial(read_mesh, length_unit="mm")),
     **dict.fromkeys((".stl", ".obj", ".ply"), partial(read_surface, length_unit="mm")),
-    **dict.fromkeys((".nii", ".nii.gz", ".nrrd", ".mha", ".dcm"), partial(read_labels, wanted=[1])),
+    **dict.fromkeys((".nii", ".nii.gz", ".nrrd", ".mha", ".dcm"), read_labels),
     ".toml": load_scene,
     ".urdf": read_xml,
     ".csv": read_recording,

@@ -286,11 +286,11 @@ def _at_border(tags: NDArray[np.uint8], image: LabelImage) -> list[str]:
     notes = []
     for axis in range(3):
         counts = np.count_nonzero(tags, axis=tuple({0, 1, 2} - {axis}))
-        used, spacing = np.flatnonzero(counts), np.delete(image.geometry.spacing, axis)
-        for edge, step, border, high in ((used[0], 1, 0, False), (used[-1], -1, image.shape[axis] - 1, True)):
-            before = counts[edge + step] if len(used) > 1 else 0
-            if edge + image.corner[axis] == border and counts[edge] > TAPER * before:
-                area_cm2 = counts[edge] * float(np.prod(spacing)) * 1e4
+        low = image.corner[axis]
+        counts = np.pad(counts, (low, image.shape[axis] - low - len(counts)))
+        for high, slices in ((False, counts), (True, counts[::-1])):
+            if slices[0] > TAPER * slices[1:2].sum():
+                area_cm2 = slices[0] * float(np.prod(np.delete(image.geometry.spacing, axis))) * 1e4
                 notes.append(
                     f"the organ touches the image's border towards the {image.geometry.side(axis, high=high)} with a "
                     f"flat face of {area_cm2:.3g} cm^2: it is cut off there, unless that is its shape"

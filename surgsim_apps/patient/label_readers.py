@@ -235,15 +235,11 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
     Raises:
         MeshError: fewer or more axes.
     """
-    counts = [int(count) for count in shape]
-    while len(counts) > 3 and counts[-1] == 1:
-        counts.pop()
-    if len(counts) != 3:
-        text = " x ".join(map(str, counts))
-        raise MeshError(
-            f"{file}: the image has {len(counts)} axes ({text}); the rule is three: export one volume of it"
-        )
-    return counts[0], counts[1], counts[2]
+    if len(shape) < 3 or any(count != 1 for count in shape[3:]):
+        text = " x ".join(map(str, shape))
+        raise MeshError(f"{file}: the image has {len(shape)} axes ({text}); the rule is three: export one volume of it")
+    x, y, z = map(int, shape[:3])
+    return x, y, z
 
 
 def _whole_numbers(values: NDArray, slope: float, file: Path) -> tuple[NDArray, list[str]]:
@@ -404,9 +400,10 @@ def _read_segmentation(file: Path) -> LabelSource | None:
         raise MeshError(
             f"{file}: its segments are {kind:.80}; the rule is BINARY, FRACTIONAL or LABELMAP: export it so"
         )
-    stated = [
-        Segment(int(entry.SegmentNumber), (str(entry.get("SegmentLabel", "")),)) for entry in data.SegmentSequence
-    ]
+    stated = {
+        int(entry.SegmentNumber): Segment(int(entry.SegmentNumber), (str(entry.get("SegmentLabel", "")),))
+        for entry in data.SegmentSequence
+    }
     frames = list(data.get("PerFrameFunctionalGroupsSequence", ()))
     rows, columns = int(data.Rows), int(data.Columns)
     geometry, slices, notes = _geometry(file, data, frames)
@@ -416,13 +413,13 @@ def _read_segmentation(file: Path) -> LabelSource | None:
     if kind != "LABELMAP":
         groups = [_group(data, frame, "SegmentIdentificationSequence") for frame in frames]
         numbers = np.array([int(group.ReferencedSegmentNumber) for group in groups])
-    repeated = len(frames) - len(set(zip(numbers.tolist(), slices.tolist(), strict=True)))
+    repeated = len(frames) - len(np.unique(np.column_stack([numbers, slices]), axis=0))
     if repeated:
         raise MeshError(f"{file}: {repeated} of its frames repeat a slice; the rule is one for each: export it again")
     if kind == "LABELMAP":
         values = np.zeros(shape, dtype=pixels.dtype)
         values[..., slices] = pixels.T
-        return LabelSource.from_values(file, values, geometry, stated, notes)
+        return LabelSource.from_values(file, values, geometry, stated.values(), notes)
     smallest = 0.5
     if kind == "FRACTIONAL":
         most, largest = int(data.MaximumFractionalValue), int(pixels.max())
@@ -441,7 +438,7 @@ def _read_segmentation(file: Path) -> LabelSource | None:
         inside[..., slices[chosen]] = pixels[chosen].T >= smallest
         return inside
 
-    segments = tuple(segment for segment in stated if segment.value in used)
+    segments = tuple(stated.get(number, Segment(number)) for number in sorted(set(used.tolist())))
     return LabelSource(file, shape, geometry, segments, mask, tuple(notes))
 
 

@@ -63,7 +63,7 @@ def parse_labels(text: str, *, file_count: int = 1, zero_is_outside: bool = True
         names.append(LabelName(check_name(name, "--labels"), number))
     values = [label.value for label in names] if file_count == 1 else []
     for entries in ([label.name for label in names], values):
-        _check_distinct(entries, "each tissue has one label of its own")
+        _check_distinct(entries, "in --labels each tissue has a label of its own")
     if file_count not in (1, len(names)):
         raise MeshError(
             f"--labels: {len(names)} labels are given for {file_count} files; give each file's, in their order"
@@ -74,7 +74,7 @@ def parse_labels(text: str, *, file_count: int = 1, zero_is_outside: bool = True
 def _check_distinct(entries: Sequence[int | str], rule: str) -> None:
     twice = next((entry for entry in entries if entries.count(entry) > 1), None)
     if twice is not None:
-        raise MeshError(f"--labels: {twice!r} is given twice; {rule}")
+        raise MeshError(f"{twice!r} is given twice; {rule}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ def read_label_image(
         _check_grid(sources[0], source)
     if labels is None:
         labels = [_only_label(source) for source in sources]
-        _check_distinct([label.name for label in labels], "rename a file, or name each one's tissue in --labels")
+        _check_distinct([label.name for label in labels], "rename a file, or name the tissue of each file in --labels")
     return _tagged(list(zip(sources if others else sources * len(labels), labels, strict=True)))
 
 

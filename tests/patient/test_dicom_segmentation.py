@@ -104,7 +104,7 @@ def test_fractions_without_a_half_of_their_maximum_or_above_it_are_refused(large
 
 @pytest.mark.parametrize("number", [1, 9])
 def test_a_label_map_holds_the_labels_of_its_voxels(number, tmp_path):
-    """Its background has a segment, too, which is no label; a number without a segment is one."""
+    """The background is no label, although it has a segment; a number without a segment is a label."""
     mask = np.zeros((30, 30, 3), dtype=bool)
     mask[5:25, 5:25] = True
     file = write_segmentation(tmp_path / "a.dcm", {"Liver": mask}, (2.0, 2.0, 2.0), (0.0, 0.0, 0.0))

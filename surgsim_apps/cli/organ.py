@@ -92,7 +92,8 @@ class Organ:
             raise ValueError(f"give a file: a label image ({', '.join(IMAGE_SUFFIXES)}), surfaces or a mesh of tets")
         unit, first = unit_of(self.length_unit), self.files[0]
         if is_image(first):
-            _refuse(self, ("length_unit", "remesh", "cell_data"), "surfaces or tets; an image has its own")
+            _refuse(self, ("length_unit",), "surfaces or tets; an image has its own")
+            _refuse(self, ("remesh", "cell_data"), "a file of tets")
         elif first.suffix.lower() in SURFACE_SUFFIXES:
             _refuse(self, ("labels",), "a label image or tets; regions of surfaces have a file each")
             _refuse(self, ("remesh", "cell_data"), "a file of tets")

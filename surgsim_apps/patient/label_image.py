@@ -3,17 +3,23 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from msdm_core.arithmetic import norm
 from msdm_core.errors import MeshError
 from msdm_core.meshing import largest_part, parts_of
-from surgsim_apps.patient.label_readers import SLACK, ImageGeometry, LabelSource, read_labels
+from surgsim_apps.patient.label_readers import (
+    SLACK,
+    ImageGeometry,
+    LabelSource,
+    Segment,
+    farthest_corner,
+    read_labels,
+    sides_text,
+)
 from surgsim_apps.patient.materials import check_name, is_lesion
 from surgsim_apps.patient.surface_files import region_name
 
@@ -57,14 +63,18 @@ def parse_labels(text: str, *, file_count: int = 1, zero_is_outside: bool = True
         names.append(LabelName(check_name(name, "--labels"), number))
     values = [label.value for label in names] if file_count == 1 else []
     for entries in ([label.name for label in names], values):
-        twice = next((entry for entry in entries if entries.count(entry) > 1), None)
-        if twice is not None:
-            raise MeshError(f"--labels: {twice!r} is given twice; each tissue has one label of its own")
+        _check_distinct(entries, "in --labels each tissue has a label of its own")
     if file_count not in (1, len(names)):
         raise MeshError(
             f"--labels: {len(names)} labels are given for {file_count} files; give each file's, in their order"
         )
     return tuple(names)
+
+
+def _check_distinct(entries: Sequence[int | str], rule: str) -> None:
+    twice = next((entry for entry in entries if entries.count(entry) > 1), None)
+    if twice is not None:
+        raise MeshError(f"{twice!r} is given twice; {rule}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,37 +124,51 @@ def read_label_image(
             labels without `labels`; files on other grids.
     """
     files = [file, *others]
-    missing = next((path for path in files if not path.is_file()), None)
-    if missing is not None:
-        raise MeshError(f"{missing}: no such file; check the path (current folder: {Path.cwd()})")
+    for path in files:
+        if not path.is_file():
+            raise MeshError(f"{path}: no such file; check the path (current folder: {Path.cwd()})")
     sources = [read_labels(path) for path in files]
     for source in sources[1:]:
         _check_grid(sources[0], source)
-    chosen = [_only_label(source) for source in sources] if labels is None else labels
-    return _tagged(list(zip(sources if others else sources * len(chosen), chosen, strict=True)))
+    if labels is None:
+        labels = [_only_label(source) for source in sources]
+        _check_distinct([label.name for label in labels], "rename a file, or name the tissue of each file in --labels")
+    return _tagged(list(zip(sources if others else sources * len(labels), labels, strict=True)))
 
 
 def _only_label(source: LabelSource) -> LabelName:
-    present = source.present()
-    if len(present) != 1:
-        advice = f"give {FORM}" if present else "leave it out"
-        raise MeshError(f"{source.file}: which label is it? {source.present_text}: {advice}")
-    return LabelName(region_name(source.file), present[0].value)
+    if len(source.segments) != 1:
+        advice = f"give {FORM}" if source.segments else "leave it out"
+        raise MeshError(f"{source.file}: which label is it? {source.segments_text}: {advice}")
+    return LabelName(region_name(source.file), source.segments[0].value)
+
+
+def _segment(source: LabelSource, label: LabelName) -> Segment:
+    """The label of a file with a number or a name."""
+    fits = [segment for segment in source.segments if label.value == segment.value or label.value in segment.names]
+    if not fits:
+        raise MeshError(
+            f"{source.file}: label {label.value} ({label.name!r}) is nowhere in the image; {source.segments_text}: "
+            "correct --labels"
+        )
+    if len(fits) > 1:
+        raise MeshError(
+            f"{source.file}: label {label.value} is that of {len(fits)} segments ({'; '.join(map(str, fits))}): choose "
+            "by number, name or ID in --labels"
+        )
+    return fits[0]
 
 
 def _check_grid(first: LabelSource, other: LabelSource) -> None:
     """Refuse an image with other voxels than the first's."""
-    grids, corners = [], []
-    for source in (first, other):
-        counts = np.array(source.shape)
-        sides = " x ".join(f"{length * 1e3:.4g}" for length in source.geometry.spacing)
-        grids.append(f"{' x '.join(map(str, source.shape))} voxels of {sides} mm")
-        ends = np.array(list(product((0, 1), repeat=3))) * (counts - 1)
-        corners.append(source.geometry.places(ends * source.geometry.spacing))
-    apart = float(norm(corners[1] - corners[0], axis=1).max())
+    apart = farthest_corner(first.geometry.affine, other.geometry.affine, first.shape)
     if first.shape != other.shape or apart > SLACK * first.geometry.spacing.min():
+        grids = [
+            f"{' x '.join(map(str, source.shape))} voxels of {sides_text(source.geometry.spacing)}"
+            for source in (other, first)
+        ]
         raise MeshError(
-            f"{other.file}: its grid is not that of {first.file.name}: {grids[1]} for {grids[0]}, a corner lies "
+            f"{other.file}: its grid is not that of {first.file.name}: {' for '.join(grids)}, a voxel lies up to "
             f"{apart * 1e3:.4g} mm apart; resample it by nearest neighbours, as SimpleITK.Resample(image, first_image, "
             "SimpleITK.Transform(), SimpleITK.sitkNearestNeighbor) does"
         )
@@ -153,21 +177,15 @@ def _check_grid(first: LabelSource, other: LabelSource) -> None:
 def _tagged(chosen: Sequence[tuple[LabelSource, LabelName]]) -> LabelImage:
     """Image of labels with one grid, cropped to them; of labels that overlap the later applies, with a note."""
     first = chosen[0][0]
-    tags, counts, notes = np.zeros(first.shape, dtype=np.uint8), [0], list[str]()
+    tags, notes = np.zeros(first.shape, dtype=np.uint8), list[str]()
     volume = float(np.prod(first.geometry.spacing)) * 1e6
     for tag, (source, label) in enumerate(chosen, start=1):
-        mask = source.mask(source.segment(label.value))
-        counts.append(int(np.count_nonzero(mask)))
-        if not counts[tag]:
-            raise MeshError(
-                f"{source.file}: label {label.value} ({label.name!r}) is nowhere in the image; {source.present_text}: "
-                "correct --labels"
-            )
+        mask = source.mask(_segment(source, label))
         covered = np.bincount(tags[mask], minlength=tag)
-        for under in [int(tag) for tag in np.flatnonzero(covered) if tag]:
+        tags[mask] = tag
+        for under in (np.flatnonzero(covered[1:]) + 1).tolist():
             file, lower = chosen[under - 1]
-            counts[under] -= int(covered[under])
-            if not counts[under]:
+            if not (tags == under).any():
                 raise MeshError(
                     f"{file.file}: label {lower.value} ({lower.name!r}) is covered wholly by later ones, the last "
                     f"{label.value} ({label.name!r}): where labels overlap the later applies; give the inner one later"
@@ -176,23 +194,15 @@ def _tagged(chosen: Sequence[tuple[LabelSource, LabelName]]) -> LabelImage:
                 f"{lower.name} and {label.name} overlap in {covered[under]} voxels ({covered[under] * volume:.4g} ml): "
                 f"they are {label.name}, the later one"
             )
-        tags[mask] = tag
-    return _cropped(tags, chosen, notes)
-
-
-def _cropped(tags: NDArray[np.uint8], chosen: Sequence[tuple[LabelSource, LabelName]], notes: list[str]) -> LabelImage:
-    box = []
-    for axis in range(3):
-        used = np.flatnonzero(tags.any(axis=tuple({0, 1, 2} - {axis})))
-        box.append(slice(int(used[0]), int(used[-1]) + 1))
-    x, y, z = (span.start for span in box)
+    (box,) = ndimage.find_objects((tags > 0).view(np.uint8))
+    corner = tuple(side.start for side in box)
     stated = dict.fromkeys(f"{source.file.name}: {note}" for source, _ in chosen for note in source.notes)
     return LabelImage(
-        np.ascontiguousarray(tags[tuple(box)]),
+        np.ascontiguousarray(tags[box]),
         tuple(label.name for _, label in chosen),
-        chosen[0][0].geometry.moved(np.array([x, y, z], dtype=np.float64)),
-        (x, y, z),
-        chosen[0][0].shape,
+        first.geometry.moved(np.array(corner, dtype=np.float64)),
+        corner,
+        first.shape,
         (*stated, *notes),
     )
 
@@ -276,11 +286,11 @@ def _at_border(tags: NDArray[np.uint8], image: LabelImage) -> list[str]:
     notes = []
     for axis in range(3):
         counts = np.count_nonzero(tags, axis=tuple({0, 1, 2} - {axis}))
-        used, spacing = np.flatnonzero(counts), np.delete(image.geometry.spacing, axis)
-        for edge, step, border, high in ((used[0], 1, 0, False), (used[-1], -1, image.shape[axis] - 1, True)):
-            before = counts[edge + step] if len(used) > 1 else 0
-            if edge + image.corner[axis] == border and counts[edge] > TAPER * before:
-                area_cm2 = counts[edge] * float(np.prod(spacing)) * 1e4
+        low = image.corner[axis]
+        counts = np.pad(counts, (low, image.shape[axis] - low - len(counts)))
+        for high, slices in ((False, counts), (True, counts[::-1])):
+            if slices[0] > TAPER * slices[1:2].sum():
+                area_cm2 = slices[0] * float(np.prod(np.delete(image.geometry.spacing, axis))) * 1e4
                 notes.append(
                     f"the organ touches the image's border towards the {image.geometry.side(axis, high=high)} with a "
                     f"flat face of {area_cm2:.3g} cm^2: it is cut off there, unless that is its shape"
@@ -305,11 +315,7 @@ def _parts(chosen: NDArray[np.bool_], smallest: float, *, split: bool) -> tuple[
 
     Beside them their count, and count and voxels of the other parts; without `split` the mask is a single part.
     """
-    if not split:
-        count = int(np.count_nonzero(chosen))
-        kept_all = count >= smallest
-        return chosen.astype(np.uint8) * np.uint8(kept_all), int(kept_all), int(not kept_all), 0 if kept_all else count
-    label, count = parts_of(chosen, corners=True)
+    label, count = parts_of(chosen, corners=True) if split else (chosen.view(np.uint8), 1)
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
     kept = [part for part in np.argsort(-sizes, kind="stable")[:PARTS_MOST].tolist() if sizes[part] >= smallest]
     numbers = np.zeros(count + 1, dtype=np.uint8)

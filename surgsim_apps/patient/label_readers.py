@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import arccos, matmul, norm, svd
 from msdm_core.errors import MeshError
 from msdm_core.mesh import FloatArray
-from msdm_core.mesh_files import metres_per_unit, parsed
+from msdm_core.mesh_files import parsed
 
 # The axes of a scan's mesh, in words.
 CONVENTION = "x to the patient's left, y to the back, z to the head (LPS, as DICOM), metres, the scanner's own origin"
@@ -27,14 +27,15 @@ AXES = (("right", "left"), ("front", "back"), ("feet", "head"))
 # NIfTI's axes are RAS: x to the right and y to the front.
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0])
 NRRD_SUFFIXES = (".nrrd", ".nhdr")
-METRES = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6}
+METRES = {"meter": 1.0, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "micron": 1e-6, "um": 1e-6}
 # Segmentation Storage and Label Map Segmentation Storage (DICOM PS3.4, B.5).
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 # Largest distance of frames off the grid, over the slice step, or over 1 mm for thinner slices; and largest difference
 # of two statements of a header about one length, over the voxels' spacing.
 SLACK = 0.02
-# Largest distance of labels in floats from whole numbers, and largest relative difference of pixels: rounding.
-ROUNDING = 1e-3
+# Largest distance of labels in floats from whole numbers, and largest relative difference of pixels: rounding. Large
+# labels are off by a share of their own.
+ROUNDING, ROUNDING_SHARE = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +62,18 @@ class ImageGeometry:
             file: for messages.
 
         Raises:
-            MeshError: axes that are not at right angles, a spacing outside SPACING_RANGE.
+            MeshError: axes that are not at right angles, a spacing outside SPACING_RANGE, an origin that is not finite.
         """
         spacing = norm(matrix, axis=0)
         low, high = SPACING_RANGE
         if not ((spacing >= low) & (spacing <= high)).all():
-            shown = " x ".join(f"{length * 1e3:.4g}" for length in spacing)
             raise MeshError(
-                f"{file}: the header's voxels are {shown} mm; the rule is {low * 1e3:g} to {high * 1e3:g} mm a side: "
-                "is the header's length unit right?"
+                f"{file}: the header's voxels are {sides_text(spacing)}; the rule is {low * 1e3:g} to {high * 1e3:g} "
+                "mm a side: is the header's length unit right?"
+            )
+        if not np.isfinite(origin).all():
+            raise MeshError(
+                f"{file}: the header's origin is {origin}; the rule is three finite numbers: export it again"
             )
         direction = matrix / spacing
         cosines = np.abs(matmul(direction.T, direction) - np.eye(3))
@@ -84,6 +88,11 @@ class ImageGeometry:
         left, _, right = svd(direction)
         return cls(spacing, matmul(left, right), np.asarray(origin, dtype=np.float64))
 
+    @property
+    def affine(self) -> FloatArray:
+        """Matrix from (i, j, k, 1) to the voxel's position (3, 4) [m]."""
+        return np.column_stack([self.direction * self.spacing, self.origin])
+
     def moved(self, corner: FloatArray) -> "ImageGeometry":
         """Geometry of a part of the image from voxel `corner` (3,) on."""
         return ImageGeometry(self.spacing, self.direction, self.places(np.asarray(corner) * self.spacing))
@@ -97,6 +106,17 @@ class ImageGeometry:
         along = self.direction[:, axis]
         main = int(np.argmax(np.abs(along)))
         return AXES[main][int((along[main] > 0) == high)]
+
+
+def sides_text(spacing: FloatArray) -> str:
+    """Sides of a voxel (3,) [m] in words."""
+    return f"{' x '.join(f'{length * 1e3:.4g}' for length in spacing)} mm"
+
+
+def farthest_corner(first: FloatArray, other: FloatArray, shape: Sequence[int]) -> float:
+    """Largest distance between an image's corner voxels as placed by two affines, in the unit of both."""
+    corners = np.array(list(product(*((0, count - 1) for count in shape), (1,))), dtype=np.float64)
+    return float(norm(matmul(corners, (other - first).T), axis=1).max())
 
 
 @dataclass(frozen=True)
@@ -117,7 +137,7 @@ class Segment:
         """The label in one line."""
         name = " ".join(self.names[0].split())[:40] if self.names else ""
         if self.layer is not None:
-            return f"{name}: layer {self.layer}, value {self.value}"
+            return f"{name or 'nameless'}: layer {self.layer}, value {self.value}"
         return f"{self.value} ({name})" if name else f"{self.value}"
 
 
@@ -129,8 +149,7 @@ class LabelSource:
         file: its path
         shape: its voxel counts                                 (3,)
         geometry: spacing, directions and origin
-        stated: labels that the header describes
-        present: the labels that voxels have
+        segments: the labels that voxels have
         mask: true at a label's voxels                          (n_x, n_y, n_z)
         notes: assumptions about the header and the values, for the report
     """
@@ -138,8 +157,7 @@ class LabelSource:
     file: Path
     shape: tuple[int, int, int]
     geometry: ImageGeometry
-    stated: tuple[Segment, ...]
-    present: Callable[[], Sequence[Segment]]
+    segments: tuple[Segment, ...]
     mask: Callable[[Segment], NDArray[np.bool_]]
     notes: tuple[str, ...] = ()
 
@@ -149,7 +167,7 @@ class LabelSource:
         file: Path,
         values: NDArray,
         geometry: ImageGeometry,
-        stated: tuple[Segment, ...] = (),
+        stated: Iterable[Segment] = (),
         notes: Iterable[str] = (),
         *,
         slope: float = 0.0,
@@ -158,7 +176,7 @@ class LabelSource:
 
         Args:
             file: its path.
-            values: of the voxels.
+            values: of the voxels; 0 is outside.
             geometry: spacing, directions and origin.
             stated: labels that the header describes.
             notes: assumptions about the header.
@@ -168,45 +186,28 @@ class LabelSource:
             MeshError: values that are no whole numbers.
         """
         whole, deviations = _whole_numbers(values, slope, file)
-
-        def present() -> Sequence[Segment]:
-            if whole.ndim == 4:
-                return stated
-            known = {segment.value: segment for segment in stated}
-            return [known.get(int(value), Segment(int(value))) for value in np.unique(whole) if value]
-
-        def mask(segment: Segment) -> NDArray[np.bool_]:
-            return (whole if whole.ndim == 3 else whole[..., segment.layer or 0]) == segment.value
-
+        layers: dict[int | None, NDArray] = (
+            {None: whole} if whole.ndim == 3 else dict(enumerate(np.moveaxis(whole, -1, 0)))
+        )
+        known = {(segment.layer, segment.value): segment for segment in stated}
+        # Most voxels are 0, and sorting all takes its time.
+        segments = tuple(
+            known.get((layer, int(value)), Segment(int(value), layer=layer))
+            for layer, numbers in layers.items()
+            for value in np.unique(numbers[numbers != 0])
+        )
         x, y, z = whole.shape[:3]
-        return cls(file, (x, y, z), geometry, stated, present, mask, (*notes, *deviations))
+        notes = (*notes, *deviations)
+        return cls(file, (x, y, z), geometry, segments, lambda chosen: layers[chosen.layer] == chosen.value, notes)
 
     @property
-    def present_text(self) -> str:
+    def segments_text(self) -> str:
         """The labels that voxels have, at most 20 of them, for messages."""
-        known = self.present()
-        dots = ", ..." if len(known) > 20 else ""
-        separator = "; " if any(segment.layer is not None for segment in known) else ", "
-        text = separator.join(map(str, known[:20]))
-        return f"there are labels {text}{dots}" if known else "there are no labels at all, every voxel is 0"
-
-    def segment(self, label: int | str) -> Segment:
-        """The label with a number or a name of the file.
-
-        Raises:
-            MeshError: a name that no label has, or several labels with the name or number.
-        """
-        fits = [segment for segment in self.stated if label == segment.value or label in segment.names]
-        if len(fits) == 1:
-            return fits[0]
-        if fits:
-            raise MeshError(
-                f"{self.file}: label {label} is that of {len(fits)} segments ({'; '.join(map(str, fits))}): choose by "
-                "the file's names in --labels, such as liver=NAME"
-            )
-        if isinstance(label, str):
-            raise MeshError(f"{self.file}: no label is called {label!r}; {self.present_text}: correct --labels")
-        return Segment(label)
+        if not self.segments:
+            return "there are no labels at all, every voxel is 0"
+        separator = ", " if self.segments[0].layer is None else "; "
+        dots = f"{separator}..." if len(self.segments) > 20 else ""
+        return f"there are labels {separator.join(map(str, self.segments[:20]))}{dots}"
 
 
 def read_labels(file: Path) -> LabelSource:
@@ -234,15 +235,11 @@ def checked_shape(shape: Sequence[int], file: Path) -> tuple[int, int, int]:
     Raises:
         MeshError: fewer or more axes.
     """
-    counts = [int(count) for count in shape]
-    while len(counts) > 3 and counts[-1] == 1:
-        counts.pop()
-    if len(counts) != 3:
-        text = " x ".join(map(str, counts))
-        raise MeshError(
-            f"{file}: the image has {len(counts)} axes ({text}); the rule is three: export one volume of it"
-        )
-    return counts[0], counts[1], counts[2]
+    if len(shape) < 3 or any(count != 1 for count in shape[3:]):
+        text = " x ".join(map(str, shape))
+        raise MeshError(f"{file}: the image has {len(shape)} axes ({text}); the rule is three: export one volume of it")
+    x, y, z = map(int, shape[:3])
+    return x, y, z
 
 
 def _whole_numbers(values: NDArray, slope: float, file: Path) -> tuple[NDArray, list[str]]:
@@ -263,18 +260,16 @@ def _whole_numbers(values: NDArray, slope: float, file: Path) -> tuple[NDArray, 
     with np.errstate(invalid="ignore"):
         whole = np.rint(values)
         deviation = np.abs(values - whole)
-        wrong = ~(deviation <= slack * (1.0 + 1e-6))
+        wrong = ~(deviation <= slack + ROUNDING_SHARE * np.abs(whole))
     stored = f", stored as integers with a slope of {slope:.4g}," if slope else ""
     if wrong.any():
         raise MeshError(
-            f"{file}: the image{stored} holds {float(values[wrong][0]):.7g}, which is no whole number: labels are; is "
+            f"{file}: the image{stored} holds {float(values[wrong][0]):.9g}, which is no whole number: labels are; is "
             "this the scan itself, or resampled with interpolation? Export a label map of integers, resampled by "
             "nearest neighbours"
         )
     largest = float(deviation.max(initial=0.0))
-    return (
-        (whole, [f"the labels{stored} are up to {largest:.2g} off whole numbers: rounded"]) if largest else (values, [])
-    )
+    return whole, [f"the labels{stored} are up to {largest:.2g} off whole numbers: rounded"] if largest else []
 
 
 def _read_nifti(file: Path) -> LabelSource:
@@ -290,47 +285,45 @@ def _read_nifti(file: Path) -> LabelSource:
     if unit not in METRES:
         notes.append("the header states no length unit: millimetres are assumed, as NIfTI's readers do")
     metres = METRES.get(unit, 1e-3)
-    if int(header["sform_code"]):
-        notes += _other_places(header, image.affine, shape, metres * 1e3)
-    elif not int(header["qform_code"]):
-        notes.append("the header states no orientation: left and right, front and back may be swapped")
     matrix, origin = np.hsplit(matmul(RAS_TO_LPS, image.affine[:3] * metres), [3])
     geometry = ImageGeometry.from_matrix(matrix, origin[:, 0], file)
+    if int(header["sform_code"]):
+        notes += _other_places(header, image.affine, shape, metres)
+    elif not int(header["qform_code"]):
+        notes.append("the header states no orientation: left and right, front and back may be swapped")
     values = np.asanyarray(image.dataobj).reshape(shape)
     slope = abs(float(image.dataobj.slope)) if image.get_data_dtype().kind in "iu" else 0.0
     return LabelSource.from_values(file, values, geometry, _label_table(header.extensions), notes, slope=slope)
 
 
-def _other_places(header: Any, sform: FloatArray, shape: Sequence[int], unit_mm: float) -> list[str]:
+def _other_places(header: Any, sform: FloatArray, shape: Sequence[int], metres: float) -> list[str]:
     """Note on a NIfTI header whose qform, or pixdim without one, gives other places than its sform, which applies."""
     spacing, pixdim = norm(sform[:3, :3], axis=0), np.abs(header["pixdim"][1:4])
     try:
-        by_qform = int(header["qform_code"]) > 0
-        other = header.get_qform() if by_qform else sform * np.append(pixdim / spacing, 1.0)
+        qform, _ = header.get_qform(coded=True)
     except ValueError as error:
         return [f"the header's qform is no rotation ({error}): its sform is used"]
-    corners = np.array(list(product(*((0, count - 1) for count in shape), (1,))), dtype=np.float64)
-    apart = float(norm(matmul(corners, (other - sform).T), axis=1).max())
+    apart = farthest_corner(sform, sform * np.append(pixdim / spacing, 1.0) if qform is None else qform, shape)
     if apart <= SLACK * spacing.min():
         return []
-    sides = [" x ".join(f"{length * unit_mm:.5g}" for length in lengths) for lengths in (spacing, pixdim)]
     return [
-        f"the header's sform (voxels of {sides[0]} mm) and {'qform' if by_qform else 'pixdim'} ({sides[1]} mm) differ: "
-        f"a corner of the image lies {apart * unit_mm:.4g} mm apart in them; the sform is used"
+        f"the header's sform (voxels of {sides_text(spacing * metres)}) and {'pixdim' if qform is None else 'qform'} "
+        f"({sides_text(pixdim * metres)}) differ: a corner of the image lies {apart * metres * 1e3:.4g} mm apart in "
+        "them; the sform is used"
     ]
 
 
-def _label_table(extensions: Iterable[Any]) -> tuple[Segment, ...]:
+def _label_table(extensions: Iterable[Any]) -> list[Segment]:
     """Labels of the XML table that Connectome Workbench and TotalSegmentator write into NIfTI headers."""
+    segments = []
     for extension in extensions:
         content = extension.get_content()
         text = content.decode(errors="replace") if isinstance(content, bytes) else str(content)
-        if "<LabelTable" in text:
-            # Names only help: a broken table is as good as none.
-            with contextlib.suppress(ElementTree.ParseError, ValueError):
-                labels = ElementTree.fromstring(text.strip("\0 \n")).iter("Label")
-                return tuple(Segment(int(label.get("Key", "")), (label.text or "",)) for label in labels)
-    return ()
+        # Names only help: a broken table is as good as none, and so is an extension that is no XML.
+        with contextlib.suppress(ElementTree.ParseError, ValueError):
+            labels = ElementTree.fromstring(text.strip("\0 \n")).iter("Label")
+            segments += [Segment(int(label.get("Key", "")), (label.text or "",)) for label in labels]
+    return segments
 
 
 def _read_itk(file: Path) -> LabelSource:
@@ -347,33 +340,36 @@ def _read_itk(file: Path) -> LabelSource:
     stated = _slicer_segments(header, layered=components > 1)
     if components > 1 and not stated:
         raise MeshError(f"{file}: each voxel has {components} numbers; the rule is one label: export one layer of it")
-    if not all(0 <= (segment.layer or 0) < components for segment in stated):
-        raise MeshError(f"{file}: its segments ({'; '.join(map(str, stated))}) name layers, but it has {components}")
     dimension = reader.GetDimension()
     direction = np.array(reader.GetDirection()).reshape(dimension, dimension)[:3, :3]
-    metres = 1e-3 if file.suffix.lower() not in NRRD_SUFFIXES else _nrrd_unit(file)
+    metres, notes = 1e-3, []
+    if file.suffix.lower() in NRRD_SUFFIXES:
+        metres = _nrrd_unit(file)
+        # Other anatomical spaces are turned into this one by SimpleITK.
+        if header.get("NRRD_space") != "left-posterior-superior":
+            notes.append("the header names no anatomical space: left, back and up (LPS) are assumed")
     matrix = direction * np.array(reader.GetSpacing()[:3]) * metres
     geometry = ImageGeometry.from_matrix(matrix, np.array(reader.GetOrigin()[:3]) * metres, file)
-    notes: tuple[str, ...] = ()
-    if file.suffix.lower() in NRRD_SUFFIXES and "NRRD_space" not in header:
-        notes = ("the header names no anatomical space: left, back and up (LPS) are assumed",)
     # SimpleITK's arrays have the axes reversed, but the layers last.
-    values = SimpleITK.GetArrayFromImage(reader.Execute())
-    values = np.moveaxis(values.T, 0, -1).reshape(*shape, -1) if components > 1 else values.T.reshape(shape)
+    values = SimpleITK.GetArrayFromImage(reader.Execute()).reshape(*shape[::-1], components).transpose(2, 1, 0, 3)
     # RescaleSlope (DICOM PS3.6).
     slope = abs(float(header.get("0028|1053", 0.0)))
-    return LabelSource.from_values(file, values, geometry, stated, notes, slope=slope)
+    layers = values if components > 1 else values[..., 0]
+    return LabelSource.from_values(file, layers, geometry, stated, notes, slope=slope)
 
 
 def _nrrd_unit(file: Path) -> float:
-    """Metres per unit of an NRRD file's space, millimetres if it states none; SimpleITK reads no units."""
+    """Metres per unit of an NRRD file's axes, millimetres if it states none; SimpleITK does not apply units."""
     with file.open("rb") as stream:
-        head = b"".join(iter(lambda: stream.readline().strip(), b""))
-    units = re.search(rb'space units:((?:\s*"[^"]*")+)', head)
-    stated = set(re.findall(r'"([^"]*)"', units[1].decode(errors="replace")) if units else ())
-    if len(stated) > 1:
-        raise MeshError(f"{file}: its axes have units {', '.join(sorted(stated))}; the rule is one: export it again")
-    return metres_per_unit(stated.pop()) if stated else 1e-3
+        lines = list(iter(lambda: stream.readline().strip(), b""))
+    fields = b"".join(line for line in lines if re.match(rb"(space )?units:", line)).decode(errors="replace")
+    stated = set(re.findall(r'"([^"]*)"', fields)) - {""} or {"mm"}
+    if len(stated) > 1 or not stated <= METRES.keys():
+        raise MeshError(
+            f"{file}: its axes have units {', '.join(sorted(stated))}; the rule is a single one of "
+            f"{', '.join(METRES)}: export it again"
+        )
+    return METRES[stated.pop()]
 
 
 def _slicer_segments(header: dict[str, str], *, layered: bool) -> tuple[Segment, ...]:
@@ -391,48 +387,59 @@ def _slicer_segments(header: dict[str, str], *, layered: bool) -> tuple[Segment,
 def _read_segmentation(file: Path) -> LabelSource | None:
     """Read a DICOM segmentation; None for another DICOM file."""
     import pydicom
+    from pydicom.uid import UID
 
     data: Any = pydicom.dcmread(file)
-    if str(data.get("SOPClassUID", "")) not in CLASSES:
+    storage = UID(data.get("SOPClassUID", ""))
+    if "PixelData" not in data:
+        raise MeshError(f"{file}: has no voxels ({storage.name}): export it as a DICOM segmentation (SEG)")
+    if storage not in CLASSES:
         return None
     kind = str(data.SegmentationType)
     if kind not in ("BINARY", "FRACTIONAL", "LABELMAP"):
         raise MeshError(
             f"{file}: its segments are {kind:.80}; the rule is BINARY, FRACTIONAL or LABELMAP: export it so"
         )
-    segments = tuple(Segment(int(entry.SegmentNumber), (str(entry.SegmentLabel),)) for entry in data.SegmentSequence)
+    stated = {
+        int(entry.SegmentNumber): Segment(int(entry.SegmentNumber), (str(entry.get("SegmentLabel", "")),))
+        for entry in data.SegmentSequence
+    }
     frames = list(data.get("PerFrameFunctionalGroupsSequence", ()))
     rows, columns = int(data.Rows), int(data.Columns)
     geometry, slices, notes = _geometry(file, data, frames)
-    shape = checked_shape((columns, rows, int(slices.max()) + 1), file)
+    shape = columns, rows, int(slices.max()) + 1
     pixels = np.atleast_3d(data.pixel_array).reshape(len(frames), rows, columns)
     numbers = np.zeros(len(frames), dtype=np.int64)
     if kind != "LABELMAP":
         groups = [_group(data, frame, "SegmentIdentificationSequence") for frame in frames]
         numbers = np.array([int(group.ReferencedSegmentNumber) for group in groups])
-    repeated = len(frames) - len(set(zip(numbers.tolist(), slices.tolist(), strict=True)))
+    repeated = len(frames) - len(np.unique(np.column_stack([numbers, slices]), axis=0))
     if repeated:
         raise MeshError(f"{file}: {repeated} of its frames repeat a slice; the rule is one for each: export it again")
+    if kind == "LABELMAP":
+        values = np.zeros(shape, dtype=pixels.dtype)
+        values[..., slices] = pixels.T
+        return LabelSource.from_values(file, values, geometry, stated.values(), notes)
     smallest = 0.5
     if kind == "FRACTIONAL":
-        most = int(data.MaximumFractionalValue)
+        most, largest = int(data.MaximumFractionalValue), int(pixels.max())
         smallest = 0.5 * most
         text = f"the segments are fractions ({data.get('SegmentationFractionalType')}) of {most}"
-        if pixels.max() < smallest:
-            raise MeshError(f"{file}: {text}, and no voxel has half of that: the largest value is {pixels.max()}")
+        if not 0.0 < smallest <= largest <= most:
+            raise MeshError(
+                f"{file}: {text}, and the largest value is {largest}; the rule is half of the maximum to the maximum: "
+                "export it as BINARY"
+            )
         notes.append(f"{text}: voxels of at least half of that are taken")
-
-    def present() -> Sequence[Segment]:
-        return [segment for segment in segments if mask(segment).any()]
+    used = numbers[(pixels >= smallest).any(axis=(1, 2))]
 
     def mask(segment: Segment) -> NDArray[np.bool_]:
-        inside = np.zeros(shape, dtype=bool)
-        for frame in np.flatnonzero((numbers == segment.value) | (kind == "LABELMAP")):
-            own = pixels[frame].T
-            inside[..., slices[frame]] = own == segment.value if kind == "LABELMAP" else own >= smallest
+        inside, chosen = np.zeros(shape, dtype=bool), numbers == segment.value
+        inside[..., slices[chosen]] = pixels[chosen].T >= smallest
         return inside
 
-    return LabelSource(file, shape, geometry, segments, present, mask, tuple(notes))
+    segments = tuple(stated.get(number, Segment(number)) for number in sorted(set(used.tolist())))
+    return LabelSource(file, shape, geometry, segments, mask, tuple(notes))
 
 
 def _group(data: Any, frame: Any, name: str) -> Any:
@@ -443,26 +450,21 @@ def _group(data: Any, frame: Any, name: str) -> Any:
 
 def _geometry(file: Path, data: Any, frames: Sequence[Any]) -> tuple[ImageGeometry, NDArray[np.int64], list[str]]:
     """Geometry of the stack, slice of each frame (n_frame,), and notes on the header."""
-    planes = [_group(data, frame, "PlaneOrientationSequence") for frame in frames]
-    positions = [_group(data, frame, "PlanePositionSequence") for frame in frames]
-    if not frames or None in planes or None in positions:
+    names = ("PlaneOrientationSequence", "PlanePositionSequence", "PixelMeasuresSequence")
+    planes, positions, measures = ([_group(data, frame, name) for frame in frames] for name in names)
+    if not frames or None in (*planes, *positions, *measures):
         raise MeshError(
             f"{file}: its frames have no place in the patient, as of a microscope or an X-ray projection: the rule is "
             "a stack of slices: give a segmentation of CT or MR"
         )
     turns = np.array([plane.ImageOrientationPatient for plane in planes], dtype=float)
-    if np.ptp(turns, axis=0).max() > COSINE_LARGEST:
-        raise MeshError(
-            f"{file}: its frames have {len(np.unique(turns, axis=0))} orientations; the rule is one stack of parallel "
-            "slices: resample it"
-        )
-    measures = [_group(data, frame, "PixelMeasuresSequence") for frame in frames]
     sizes = np.array([measure.PixelSpacing for measure in measures], dtype=float)
-    if np.ptp(sizes, axis=0).max() > ROUNDING * sizes.min():
-        raise MeshError(
-            f"{file}: its frames have pixels of {len(np.unique(sizes, axis=0))} sizes; the rule is one grid: resample "
-            "it onto one"
-        )
+    for rows, name, slack in ((turns, "orientations", COSINE_LARGEST), (sizes, "pixel sizes", ROUNDING * sizes.min())):
+        if np.ptp(rows, axis=0).max() > slack:
+            raise MeshError(
+                f"{file}: its frames have {len(np.unique(rows, axis=0))} {name}; the rule is one stack of parallel "
+                "slices on one grid: resample it"
+            )
     turn = turns[0].reshape(2, 3)
     normal = np.cross(turn[0], turn[1])
     places = np.array([position.ImagePositionPatient for position in positions], dtype=float)
@@ -486,8 +488,8 @@ def _slice_step(file: Path, along: FloatArray, measures: Any) -> tuple[float, li
 
     Writers leave out empty frames: the positions alone give a multiple of the step where no two frames are neighbours.
     """
-    spacing = float(measures.get("SpacingBetweenSlices") or 0.0)
-    thickness = float(measures.get("SliceThickness") or 0.0)
+    names = ("SpacingBetweenSlices", "SliceThickness")
+    spacing, thickness = (abs(float(measures.get(name) or 0.0)) for name in names)
     apart, extent = np.diff(np.unique(np.round(along, 3))), float(np.ptp(along))
     if not len(apart):
         if not (spacing or thickness):
@@ -495,11 +497,11 @@ def _slice_step(file: Path, along: FloatArray, measures: Any) -> tuple[float, li
         return spacing or thickness, []
     nearest = float(apart.min())
     # The mean over the stack is free of the positions' rounding.
-    step = extent / max(round(extent / nearest), 1)
-    name, stated = ("SpacingBetweenSlices", spacing) if spacing else ("SliceThickness", thickness)
-    text = f"neighbouring frames lie {nearest:.4g} mm apart, and the header states {name} {stated:.4g} mm"
-    counts = np.maximum(np.rint(apart / spacing), 1.0) if spacing else np.ones(1)
-    if counts.min() > 1.0 and (np.abs(apart / spacing - counts) <= SLACK).all():
+    step = extent / round(extent / nearest)
+    stated = f"{names[0]} {spacing:.4g}" if spacing else f"{names[1]} {thickness:.4g}"
+    text = f"neighbouring frames lie {nearest:.4g} mm apart, and the header states {stated} mm"
+    counts = apart / (spacing or nearest)
+    if counts.min() > 1.5 and np.abs(counts - np.rint(counts)).max() <= SLACK:
         even = len(apart) > 1 and np.ptp(apart) <= SLACK * nearest
         if not even:
             return extent / round(extent / spacing), [f"{text}: the slices between them are taken as empty"]
@@ -510,5 +512,5 @@ def _slice_step(file: Path, along: FloatArray, measures: Any) -> tuple[float, li
                 "slices, or with the right SpacingBetweenSlices"
             )
     # Slices may overlap: a thickness above the step is no contradiction.
-    differs = abs(stated - step) > SLACK * step if spacing else 0.0 < stated < (1.0 - SLACK) * step
+    differs = abs(spacing - step) > SLACK * step if spacing else 0.0 < thickness < (1.0 - SLACK) * step
     return step, [f"{text}: the former is used"] if differs else []

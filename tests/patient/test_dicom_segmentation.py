@@ -89,11 +89,34 @@ def test_fractions_count_from_half_of_the_maximum_on(fractional_type, largest, t
     assert np.count_nonzero(image.tags == 2) == np.count_nonzero(labels == 2)
     assert any(fractional_type in note and str(largest) in note for note in image.notes)
 
-    def zero_or_one(data):
-        data.PixelData = (data.pixel_array // largest).tobytes()
 
-    with pytest.raises(MeshError, match=f"of {largest}, .* 1$"):
-        read_label_image(edited(file, zero_or_one), parse_labels("liver=1"))
+@pytest.mark.parametrize(("largest", "most"), [(1, 255), (127, 255), (255, 100), (255, 0)])
+def test_fractions_without_a_half_of_their_maximum_or_above_it_are_refused(largest, most, tmp_path):
+    file, _ = segmentation(tmp_path)
+
+    def stated(data):
+        as_bytes(data, kind="FRACTIONAL", largest=largest)
+        data.MaximumFractionalValue = most
+
+    with pytest.raises(MeshError, match=f"of {most}, .* largest value is {largest}"):
+        read_label_image(edited(file, stated), parse_labels("liver=1"))
+
+
+@pytest.mark.parametrize("number", [1, 9])
+def test_a_label_map_holds_the_labels_of_its_voxels(number, tmp_path):
+    """The background is no label, although it has a segment; a number without a segment is a label."""
+    mask = np.zeros((30, 30, 3), dtype=bool)
+    mask[5:25, 5:25] = True
+    file = write_segmentation(tmp_path / "a.dcm", {"Liver": mask}, (2.0, 2.0, 2.0), (0.0, 0.0, 0.0))
+
+    def with_background(data):
+        as_bytes(data, kind="LABELMAP", largest=number)
+        data.SegmentSequence.insert(0, item(SegmentNumber=0, SegmentLabel="Background"))
+
+    edited(file, with_background)
+    assert np.count_nonzero(read_label_image(file).tags) == 1200
+    with pytest.raises(MeshError, match=rf"'liver'.* labels {number}( \(Liver\))?: "):
+        read_label_image(file, parse_labels("liver=Background"))
 
 
 @pytest.mark.parametrize(
@@ -177,6 +200,11 @@ def tiled_full(data):
     del data.PerFrameFunctionalGroupsSequence
 
 
+def without_voxels(data):
+    data.SOPClassUID = "1.2.840.10008.5.1.4.1.1.481.3"
+    del data.PixelData
+
+
 def frame_twice(data):
     frames = data.PerFrameFunctionalGroupsSequence
     frames[1] = frames[0]
@@ -193,8 +221,9 @@ def pixels_of_two_sizes(data):
         (of_another_type, "OTHER"),
         (projection, "no place in the patient"),
         (tiled_full, "no place in the patient"),
+        (without_voxels, r"no voxels \(RT Structure Set Storage\)"),
         (frame_twice, "repeat a slice"),
-        (pixels_of_two_sizes, "2 sizes"),
+        (pixels_of_two_sizes, "2 pixel sizes"),
         (turned_once, "its frames have 2 orientations; the rule is one stack"),
         (one_slice_without_thickness, "has one slice and states no thickness"),
         (without_segments, "cannot be parsed: .*SegmentSequence"),

@@ -79,10 +79,25 @@ def test_what_simpleitk_reads_lies_there_too(suffix, tmp_path):
     assert np.count_nonzero(image.tags) == np.count_nonzero(labels)
 
 
-def test_nrrd_without_a_space_says_what_is_taken(tmp_path):
-    (tmp_path / "a.nrrd").write_bytes(
-        b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 4 4\nspacings: 2 2 2\nencoding: raw\n\n" + bytes([1] * 64)
-    )
+DIRECTIONS = "(2,0,0) (0,2,0) (0,0,2)"
+
+
+def ones_in_nrrd(path, axes):
+    text = f"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4 4 4\n{axes}\nencoding: raw\n\n"
+    path.write_bytes(text.encode() + bytes([1] * 64))
+    return path
+
+
+@pytest.mark.parametrize(
+    "axes",
+    [
+        "spacings: 2 2 2",
+        f"space dimension: 3\nspace directions: {DIRECTIONS}",
+        f"space: 3D-right-handed\nspace directions: {DIRECTIONS}",
+    ],
+)
+def test_nrrd_without_an_anatomical_space_says_what_is_taken(axes, tmp_path):
+    ones_in_nrrd(tmp_path / "a.nrrd", axes)
     image = read_label_image(tmp_path / "a.nrrd", parse_labels("liver=1"))
     assert "names no anatomical space" in " ".join(image.notes)
 
@@ -96,6 +111,7 @@ def test_nrrd_without_a_space_says_what_is_taken(tmp_path):
         (np.uint8, 1.0, 200),
         (np.float32, 1.0 - 2e-7, 3),
         (np.float32, 1.0 + 3e-4, 3),
+        (np.float32, 1.0 - 2e-7, 11101),
     ],
 )
 def test_labels_stored_with_a_slope_or_rounded_are_the_array_s(stored, scale, largest, tmp_path):
@@ -105,7 +121,7 @@ def test_labels_stored_with_a_slope_or_rounded_are_the_array_s(stored, scale, la
     image = nibabel.Nifti1Image(np.where(labels == 2, float(largest), labels) * scale, affine)
     image.set_data_dtype(stored)
     nibabel.save(image, tmp_path / "a.nii.gz")
-    # One label is apart from the others, for the type's range.
+    # The second label is apart from the first, for the type's range.
     read = read_label_image(tmp_path / "a.nii.gz", parse_labels(f"liver=1,lesion={largest}"))
     assert np.bincount(read.tags.ravel())[1:].tolist() == np.bincount(labels.ravel())[1:].tolist()
     assert any("rounded" in note for note in read.notes)
@@ -150,6 +166,14 @@ def test_an_organ_cut_off_is_said_and_one_cropped_to_is_not(suffix, cut, cropped
     assert all("head" in note and f"{np.count_nonzero(labels[..., -1]) * 0.04:.3g} cm^2" in note for note in found)
 
 
+@pytest.mark.parametrize("place", [float("nan"), float("inf")])
+def test_an_origin_that_is_no_place_is_refused(place, tmp_path):
+    header = bytearray(plain(tmp_path / "a.nii").read_bytes())
+    header[280 + 12 : 280 + 16] = struct.pack("<f", place)  # srow_x[3]
+    (tmp_path / "a.nii").write_bytes(header)
+    refused(tmp_path / "a.nii", f"origin is .*{place}")
+
+
 def two_forms(path, sform, qform, pixdim=None):
     affine, shape = affine_of()
     image = nibabel.Nifti1Image(labels_on(affine, shape), None)
@@ -192,17 +216,26 @@ def write_nrrd(path, values, layers, kinds, sizes, segments):
 
 
 @pytest.mark.parametrize(
-    ("units", "spacing"), [('"cm" "cm" "cm"', 0.02), ('"mm" "mm" "mm"', 0.002), ('"m" "m" "m"', 2.0)]
+    "axes",
+    ["spacings: 2 2 2\nunits:", f"space: LPS\nspace directions: {DIRECTIONS}\nspace units:"],
 )
-def test_space_units_of_an_nrrd_file(units, spacing, tmp_path):
-    file = tmp_path / "a.nrrd"
-    write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", f"space units: {units}\n")
-    if spacing > 1.0:
-        refused(file, "2000 x 2000 x 2000 mm")
+@pytest.mark.parametrize(
+    ("units", "spacing", "words"),
+    [
+        (["cm"] * 3, 0.02, ""),
+        (["mm"] * 3, 0.002, ""),
+        ([""] * 3, 0.002, ""),
+        (["m"] * 3, None, "2000 x 2000 x 2000 mm"),
+        (["mm", "cm", "mm"], None, "cm, mm"),
+        (["inch"] * 3, None, "inch"),
+    ],
+)
+def test_units_of_an_nrrd_file(axes, units, spacing, words, tmp_path):
+    file = ones_in_nrrd(tmp_path / "a.nrrd", f"{axes} " + " ".join(f'"{unit}"' for unit in units))
+    if spacing is None:
+        refused(file, words)
     else:
         assert read_label_image(file).geometry.spacing == pytest.approx(spacing)
-    write_nrrd(file, np.ones((4, 4, 4), np.uint8), "", "domain domain domain", "4 4 4", 'space units: "mm" "cm" "mm"\n')
-    refused(file, "cm, mm")
 
 
 @pytest.mark.parametrize(
@@ -223,7 +256,26 @@ def test_layers_of_3d_slicer_s_segments(numbers, chosen, tmp_path):
     beyond = write_nrrd(
         tmp_path / "b.nrrd", layers, "none", "list domain domain domain", sizes, SEGMENTS % (1, 0, 1, 2)
     )
-    refused(beyond, "layer 2")
+    refused(beyond, "Tumour.* is nowhere", parse_labels("liver=Liver,lesion=Tumour"))
+
+
+def test_a_segment_without_voxels_is_not_listed_and_does_not_count(tmp_path):
+    layers = np.zeros((2, 6, 6, 6), np.uint8)
+    layers[0, 2:4, 2:4, 2:4] = 1
+    file = write_nrrd(
+        tmp_path / "a.nrrd", layers, "none", "list domain domain domain", "2 6 6 6", SEGMENTS % (1, 0, 1, 1)
+    )
+    assert np.count_nonzero(read_label_image(file).tags) == 8
+    refused(file, "there are labels Liver: layer 0, value 1: correct", parse_labels("liver=Tumour"))
+
+
+def test_equal_names_in_a_file_leave_the_numbers(tmp_path):
+    segments = SEGMENTS.replace("Tumour", "Liver") % (1, 0, 2, 0)
+    values = np.ones((4, 4, 4), np.uint8)
+    values[1:3] = 2
+    file = write_nrrd(tmp_path / "a.nrrd", values, "", "domain domain domain", "4 4 4", segments)
+    refused(file, r"1 \(Liver\); 2 \(Liver\)\): choose by number", parse_labels("liver=Liver"))
+    assert np.bincount(read_label_image(file, BOTH).tags.ravel()).tolist() == [0, 32, 32]
 
 
 def test_names_of_labels_in_the_file_are_listed_and_taken(tmp_path):
@@ -280,6 +332,10 @@ def test_files_on_other_grids_and_of_several_labels_are_refused(tmp_path):
         file = write_nifti(tmp_path / f"{name}.nii.gz", values.astype(np.uint8), matrix)
         with pytest.raises(MeshError, match=words):
             read_label_image(first, others=[file])
+    (tmp_path / "b").mkdir()
+    second = write_nifti(tmp_path / "b" / "liver.nii.gz", (labels == 2).astype(np.uint8), affine)
+    with pytest.raises(MeshError, match=r"'liver' is given twice; rename a file"):
+        read_label_image(first, others=[second])
     with pytest.raises(MeshError, match=r"1 labels .* 2 files"):
         parse_labels("liver=1", file_count=2)
 

@@ -25,6 +25,8 @@ def test_nothing_half_written(tmp_path, refusal):
     ("extra", "named"),
     [
         (["--labels", "liver=1", "--length-unit", "mm"], "--length-unit"),
+        (["--labels", "liver=1", "--remesh"], "--remesh goes with a file of tets"),
+        (["--labels", "liver=1", "--cell-data", "a"], "--cell-data goes with a file of tets"),
         ([], "labels"),
         (["--labels", "liver=1", "--modulus", "lesion=5"], "lesion"),
         (["--labels", "liver=1", "--cell-size", "-1"], "-1"),

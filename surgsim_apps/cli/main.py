@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from inspect import getdoc
 
+import gymnasium.error
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -98,7 +99,7 @@ def exit_status(run: Callable[[], int | None]) -> int:
     # Invalid input (MeshError and OrganError are ValueErrors) is reported in one line without a traceback.
     except OSError as error:
         text = str(error) if error.filename is None else f"{error.filename}: {error.strerror}"
-    except ValueError as error:
+    except (ValueError, gymnasium.error.Error) as error:
         text = str(error)
     except (OverflowError, MemoryError) as error:
         text = f"a number or a file is too large for this computer ({error})"

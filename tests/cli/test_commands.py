@@ -134,7 +134,12 @@ def test_a_file_that_is_too_large_is_no_number_of_the_options(monkeypatch, capsy
 
 
 @pytest.mark.parametrize(
-    ("ending", "status", "said"), [("raise ValueError('bad')", 2, "bad"), ("signal.raise_signal(15)", 130, "stopped")]
+    ("ending", "status", "said"),
+    [
+        ("raise ValueError('bad')", 2, "bad"),
+        ("import gymnasium; gymnasium.make('SurgSim/Nope-v0')", 2, "Nope"),
+        ("signal.raise_signal(15)", 130, "stopped"),
+    ],
 )
 def test_a_script_of_agents_ends_as_a_command(ending, status, said, tmp_path):
     script = f"""

@@ -179,17 +179,23 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
 
 @contextmanager
 def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
-    """A writer of steps to telemetry.csv of a folder; without a folder it does nothing."""
+    """A writer of steps to telemetry.csv of a folder, which an error leaves there; without a folder it does nothing."""
     if folder is None:
         yield lambda telemetry: None
         return
+    failure: Exception | None = None
     with (
         output_folder(folder, [TELEMETRY_NAME]) as files,
         (files / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
-        yield lambda telemetry: writer.writerow(_row(telemetry))
+        try:
+            yield lambda telemetry: writer.writerow(_row(telemetry))
+        except Exception as error:
+            failure = error
+    if failure is not None:
+        raise failure
 
 
 def _row(telemetry: HapticTelemetry) -> list[float | int]:

@@ -5,6 +5,7 @@ import re
 import signal
 import socket
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -113,22 +114,35 @@ def test_bad_input_is_one_line(more, named, capsys):
     assert named in output and output.count("\n") == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_the_steps_until_an_end_are_kept_whole(tmp_path, monkeypatch, number):
+def failing() -> None:
+    """An error within a step."""
+    raise ValueError
+
+
+@pytest.mark.parametrize(
+    ("end", "code"),
+    [
+        (partial(signal.raise_signal, signal.SIGINT), 0),
+        (partial(signal.raise_signal, signal.SIGTERM), 0),
+        (partial(signal.raise_signal, signal.SIGHUP), 0),
+        (failing, 2),
+    ],
+)
+def test_the_steps_until_an_end_are_kept_whole(tmp_path, monkeypatch, end, code):
     """Ctrl-C is how a run ends that has no end of its own."""
 
     class Interrupted(Pacer):
         def done(self, period) -> None:
             super().done(period)
             if self.steps == 25:
-                signal.raise_signal(number)
+                end()
             self.steps += 1
 
         steps = 1
 
     monkeypatch.setattr("surgsim_apps.cli.haptics.Pacer", Interrupted)
     out = tmp_path / "out"
-    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == 0
+    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == code
     assert [path.name for path in out.iterdir()] == ["telemetry.csv"]
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))

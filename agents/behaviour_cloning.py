@@ -5,12 +5,14 @@ surgsim evaluate --policy runs/clone.json --seeds 500000:500009
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import minari
 import numpy as np
 
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.training.fit import fit
 from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
@@ -51,4 +53,4 @@ def clone(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

@@ -4,10 +4,12 @@ python -m agents.leaderboard
 """
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
@@ -184,4 +186,4 @@ def _commands(results: Sequence[Result]) -> str:
 
 
 if __name__ == "__main__":
-    write_leaderboard(shipped_results(), LEADERBOARD)
+    sys.exit(exit_status(lambda: write_leaderboard(shipped_results(), LEADERBOARD)))

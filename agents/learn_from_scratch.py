@@ -10,6 +10,7 @@ by side. The run's folder holds checkpoints (pickles: resume only runs of your o
 """
 
 import argparse
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run, output_folder
 from surgsim_apps.training.curriculum import RepeatedAction, Stage, StagedRewards
 from surgsim_apps.training.palpate_surrogate import PalpateSurrogate
@@ -223,4 +225,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

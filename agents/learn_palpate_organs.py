@@ -9,6 +9,7 @@ are kept in place of observations of 5069 numbers.
 """
 
 import argparse
+import sys
 import time
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.expert_organs import DEPTH, expert_actions
 from surgsim_apps.training.face_features import (
@@ -181,4 +183,4 @@ def learn(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

@@ -12,6 +12,7 @@ which gives way to them, labels these too.
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
 from surgsim_apps.training.fit import fit
@@ -214,4 +216,4 @@ def run(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

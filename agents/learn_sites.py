@@ -21,6 +21,7 @@ generation 0 is the upper confidence bound.
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -36,6 +37,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.figures import ERROR_LINE
 from surgsim_apps.training.acquisition import Acquisition
@@ -234,4 +236,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

@@ -26,7 +26,7 @@ PROVENANCE = "meta/surgsim.json"
 def write_dataset(
     folder: Path, env: gym.Env, episodes: Iterable[Any], *, cameras: list[str], recorded: Mapping[str, Any]
 ) -> LeRobotDataset:
-    """Write episodes one by one as a data set in a new folder, which appears at the end.
+    """Write episodes one by one as a data set in a new folder, which is removed after an error.
 
     Args:
         folder: a new one.
@@ -51,12 +51,12 @@ def write_dataset(
     # Pictures have a size from the first reset on.
     env.reset(seed=0)
     task, seeds = describe_task(env), []
-    with new_folder(folder) as place:
+    with new_folder(folder):
         dataset = LeRobotDataset.create(
             folder.name,
             rate,
             features(env, cameras),
-            root=place,
+            root=folder,
             robot_type=Path(inner.scene.instrument.model).stem,
         )
         for episode in episodes:
@@ -65,7 +65,7 @@ def write_dataset(
             dataset.save_episode()
             seeds.append(episode.seed)
         dataset.finalize()
-        (place / PROVENANCE).write_text(json.dumps({**recorded, "seeds": seeds}, indent=1) + "\n", encoding="utf-8")
+        (folder / PROVENANCE).write_text(json.dumps({**recorded, "seeds": seeds}, indent=1) + "\n", encoding="utf-8")
     return dataset
 
 

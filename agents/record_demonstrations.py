@@ -19,24 +19,23 @@ to the bit. `Recorder` records any other code with an environment:
 import argparse
 import copy
 import json
-import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import gymnasium as gym
 import minari
 import numpy as np
 from minari.data_collector.episode_buffer import EpisodeBuffer
-from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 import surgsim_env  # noqa: F401  (registers the ids)
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run, new_folder
 from surgsim_apps.scoring.episodes import EpisodeActor, agent_generator
 from surgsim_apps.scoring.evaluate import strangers_actor
@@ -229,27 +228,20 @@ def write_dataset(
     # The dataset may be used on a machine without a display.
     spec = copy.deepcopy(env.spec)
     spec.kwargs.pop("render_mode", None)
-    namespace = name.rpartition("/")[0]
-    if namespace and namespace not in list_local_namespaces():
-        create_namespace(namespace)
-    with new_folder(get_dataset_path(name)) as place:
-        root = place.parent / "datasets"
-        with warnings.catch_warnings(), patch.dict(os.environ, MINARI_DATASETS_PATH=str(root)):
-            # Minari warns that neither an email nor an environment for evaluation is given.
-            warnings.filterwarnings("ignore", message=".*is set to None")
-            minari.create_dataset_from_buffers(
-                name,
-                [episode.buffer(index, env.observation_space) for index, episode in enumerate(episodes)],
-                env=spec,
-                algorithm_name=algorithm_name,
-                author="surgsim",
-                code_permalink=CODE,
-                description=f"{len(episodes)} episodes of {spec.id} by {algorithm_name}",
-                requirements=["surgsim"],
-                jpeg_encoding=False,
-            )
-        (root / name).rename(place)
-    return minari.load_dataset(name)
+    with new_folder(get_dataset_path(name)), warnings.catch_warnings():
+        # Minari warns that neither an email nor an environment for evaluation is given.
+        warnings.filterwarnings("ignore", message=".*is set to None")
+        return minari.create_dataset_from_buffers(
+            name,
+            [episode.buffer(index, env.observation_space) for index, episode in enumerate(episodes)],
+            env=spec,
+            algorithm_name=algorithm_name,
+            author="surgsim",
+            code_permalink=CODE,
+            description=f"{len(episodes)} episodes of {spec.id} by {algorithm_name}",
+            requirements=["surgsim"],
+            jpeg_encoding=False,
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -326,4 +318,4 @@ def _record_lerobot(options: argparse.Namespace, who: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

@@ -6,8 +6,10 @@ Of `liver_family`, 128 faces take 80 to 120 minutes of processor time.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.training.recorded_faces import LANES, record_faces
 
@@ -33,4 +35,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

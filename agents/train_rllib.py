@@ -8,6 +8,7 @@ RLlib's own `PPOConfig` and `ray.tune` have the rest: checkpoints, clusters, sea
 """
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.rl_module import RLModule
 from ray.tune.registry import register_env
 
+from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run, output_folder
 
 ENV_ID, ENV_KWARGS = "SurgSim/Palpate-v0", {"scene": "phantom", "level": "standard", "memory": True}
@@ -77,4 +79,4 @@ def learn(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

@@ -367,9 +367,8 @@ def valid_inputs(kind: Kind) -> list[Files]:
         return list(kind.cases(Path(folder)))
 
 
-def work(kinds: list[str], pipe: Connection, folder: str) -> None:
-    """Read inputs by kind and seed from a pipe, until the process is ended; its own files are in a folder."""
-    tempfile.tempdir = folder
+def work(kinds: list[str], pipe: Connection) -> None:
+    """Read inputs by kind and seed from a pipe, until the process is ended."""
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
@@ -383,16 +382,16 @@ def work(kinds: list[str], pipe: Connection, folder: str) -> None:
 
 
 class Worker:
-    """A process for reading inputs in a folder, started again after its end."""
+    """A process for reading inputs, started again after its end."""
 
-    def __init__(self, kinds: list[str], folder: str) -> None:
-        self.kinds, self.folder = kinds, folder
+    def __init__(self, kinds: list[str]) -> None:
+        self.kinds = kinds
         self._start()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=work, args=(self.kinds, theirs, self.folder), daemon=True)
+        self.process = context.Process(target=work, args=(self.kinds, theirs), daemon=True)
         self.process.start()
         theirs.close()
         if not self.pipe.poll(START_SECONDS):
@@ -422,10 +421,10 @@ class Worker:
 # ---- the run ----------------------------------------------------------------------------------------------------
 
 
-def run(kinds: list[str], first_seed: int, inputs: int | None, seconds: float, folder: str) -> int:
+def run(kinds: list[str], first_seed: int, inputs: int | None, seconds: float) -> int:
     """Read inputs of each kind in turn until a number or a time is over; print the table, 1 with findings."""
     counts = {name: Counter[str]() for name in kinds}
-    worker, end, seed = Worker(kinds, folder), time.perf_counter() + seconds, first_seed * 1_000_000
+    worker, end, seed = Worker(kinds), time.perf_counter() + seconds, first_seed * 1_000_000
     while (seed % 1_000_000 < inputs) if inputs else time.perf_counter() < end:
         for name in kinds:
             outcome = worker.read(name, seed)
@@ -469,9 +468,9 @@ def main() -> int:
     unknown = [name for name in kinds if name not in KINDS]
     if unknown:
         parser.error(f"--only names {unknown[0]!r}; the kinds are {', '.join(KINDS)}")
-    # An ended worker leaves its files.
-    with tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
-        return run(kinds, options.seed, options.inputs, options.seconds, folder)
+    # An ended worker leaves its files there.
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as os.environ["TMPDIR"]:
+        return run(kinds, options.seed, options.inputs, options.seconds)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ class Evaluate:
     """Every search, and every shipped policy for this scene."""
     compare: Annotated[tuple[AnyPath, AnyPath] | None, shown_as("A B")] = None
     """Result files of two methods on the same episodes."""
-    played: Episodes = field(default_factory=Episodes)
+    options: Episodes = field(default_factory=Episodes)
 
     def run(self, console: Console) -> int:
         """Play, print and write; returns 0.
@@ -66,7 +66,7 @@ class Evaluate:
         ]
         if len(modes) != 1:
             raise ValueError(f"give one of --agent, --policy, --all, --compare; given: {' and '.join(modes) or 'none'}")
-        options = self.played
+        options = self.options
         if (options.env or options.env_kwargs) and ":" not in (self.agent or ""):
             raise ValueError(
                 "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"

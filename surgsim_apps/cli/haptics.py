@@ -121,10 +121,10 @@ class Haptics:
                     if count is None and isinstance(device, TrajectoryDevice) and device.over:
                         break
             kept = timeliness(np.zeros_like(timing), timing, time.perf_counter() - begin)
-            late = (f"{value * 1e3:.2f} ms" for value in (kept.late_p50, kept.late_p99, kept.late_most))
             console.print(
-                f"{kept.rate:.1f} haptic steps a second; half began at most {next(late)} late, "
-                f"99 % at most {next(late)}, all at most {next(late)}; {kept.skipped} steps were given up",
+                f"{kept.rate:.1f} haptic steps a second; half began at most {kept.late_p50 * 1e3:.2f} ms late, 99 % at "
+                f"most {kept.late_p99 * 1e3:.2f} ms, all at most {kept.late_most * 1e3:.2f} ms; {kept.skipped} steps "
+                "were given up",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -137,9 +137,8 @@ def _packets_text(counts: UdpCounts) -> str:
     """Numbers of poses and forces, in a sentence."""
     if not counts.accepted:
         return f"Nothing has connected{_refused(counts)}."
-    unsent = f", {counts.unsent} of which the socket refused" if counts.unsent else ""
-    forces = f"{counts.answered + counts.unsent} forces were sent{unsent}"
-    return f"{counts.accepted} poses were received{_refused(counts)}; {forces}."
+    unsent = f", {counts.unsent} could not be sent" if counts.unsent else ""
+    return f"{counts.accepted} poses were received{_refused(counts)}; {counts.answered} forces were sent{unsent}."
 
 
 def _refused(counts: UdpCounts) -> str:
@@ -180,11 +179,11 @@ def _dynamics(command: Haptics) -> DeviceDynamics | None:
 
 @contextmanager
 def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], object]]:
-    """A writer of steps to telemetry.csv of a folder, which is kept at any end; without a folder it does nothing."""
+    """A writer of steps to telemetry.csv of a folder, which an error leaves there; without a folder it does nothing."""
     if folder is None:
         yield lambda telemetry: None
         return
-    failure: BaseException | None = None
+    failure: Exception | None = None
     with (
         output_folder(folder, [TELEMETRY_NAME]) as files,
         (files / TELEMETRY_NAME).open("w", newline="", encoding="utf-8") as file,
@@ -193,8 +192,7 @@ def _telemetry(folder: Path | None) -> Iterator[Callable[[HapticTelemetry], obje
         writer.writerow(["time", *(f"{name}_{axis}" for name in VECTORS for axis in "xyz"), *NUMBERS, *FLAGS])
         try:
             yield lambda telemetry: writer.writerow(_row(telemetry))
-        except BaseException as error:
-            # Such as a closed terminal, at the next print.
+        except Exception as error:
             failure = error
     if failure is not None:
         raise failure

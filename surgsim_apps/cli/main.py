@@ -4,10 +4,10 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from inspect import getdoc
 
+import gymnasium.error
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -81,50 +81,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif isinstance(sys.stdout, io.TextIOWrapper):
         # As stderr does with letters that an encoding lacks.
         sys.stdout.reconfigure(errors="backslashreplace")
+    return exit_status(lambda: _run(sys.argv[1:] if arguments is None else arguments))
+
+
+def exit_status(run: Callable[[], int | None]) -> int:
+    """Run a program; its exit status, as of `main`, after an error or an end in a line."""
     try:
-        status = _run(sys.argv[1:] if arguments is None else arguments)
-        with _reader_or_none():
+        status = run()
+        try:
             sys.stdout.flush()
-        return status
+        except BrokenPipeError:
+            _print_nowhere()
+        return status or 0
     except KeyboardInterrupt:
         print("surgsim: stopped", file=sys.stderr)
         return 130
     # Invalid input (MeshError and OrganError are ValueErrors) is reported in one line without a traceback.
     except OSError as error:
         text = str(error) if error.filename is None else f"{error.filename}: {error.strerror}"
-    except ValueError as error:
+    except (ValueError, gymnasium.error.Error) as error:
         text = str(error)
     except (OverflowError, MemoryError) as error:
-        text = f"a number of the options is too large for this computer ({error})"
+        text = f"a number or a file is too large for this computer ({error})"
     print(f"surgsim: error: {' '.join(text.split())}", file=sys.stderr)
     return 2
 
 
 def _run(arguments: Sequence[str]) -> int:
     console = Output()
-    name, *options = arguments or ["--help"]
-    if name in ("--help", "-h"):
-        _list_commands(console)
-        return 0
+    name, *options = arguments or ["help"]
+    if name in ("help", "--help", "-h"):
+        if not options:
+            _list_commands(console)
+            return 0
+        name, options = options[0], ["--help"]
     if name == "--version":
         console.print(f"surgsim {surgsim_version()}", highlight=False)
         return 0
+    if name.startswith("-"):
+        raise ValueError(f"{name} comes before a command: give the command first, as in surgsim palpate --scene liver")
     require_known("command", name, EXAMPLES)
     kind, example = EXAMPLES[name]
-    command = None
+    description = f"{getdoc(kind)}\n\nExample: {example}"
     # tyro ends after --help, or after its message about the options.
     try:
-        with _reader_or_none():
-            command = tyro.cli(
-                kind,
-                prog=f"surgsim {name}",
-                args=options,
-                description=f"{getdoc(kind)}\n\nExample: {example}",
-                config=TYRO,
-            )
+        command = tyro.cli(kind, prog=f"surgsim {name}", args=options, description=description, config=TYRO)
     except SystemExit as ended:
         return 2 if ended.code else 0
-    if command is None:
+    except BrokenPipeError:
         return 0
     with warnings.catch_warnings(), interrupts():
         warnings.showwarning = _show_warning
@@ -146,15 +150,6 @@ def _list_commands(console: Console) -> None:
 
 def _show_warning(message: Warning | str, *_: object) -> None:
     print(f"surgsim: warning: {' '.join(str(message).split())}", file=sys.stderr)
-
-
-@contextmanager
-def _reader_or_none() -> Iterator[None]:
-    """Standard output whose reader may have left."""
-    try:
-        yield
-    except BrokenPipeError:
-        _print_nowhere()
 
 
 def _print_nowhere() -> None:

@@ -64,8 +64,8 @@ AnyPath = Annotated[Path, _parsed("PATH", path_of)]
 Paths = Annotated[tuple[AnyPath, ...], shown_as("FILE ...")]
 MaybeText = Annotated[str | None, shown_as("TEXT")]
 MaybeScene = Annotated[str | None, shown_as("SCENE")]
-MaybeNumber = Annotated[float | None, shown_as("NUMBER")]
-MaybeCount = Annotated[int | None, shown_as("COUNT")]
+MaybeNumber = Annotated[float | None, _parsed("NUMBER", float), shown_as("NUMBER")]
+MaybeCount = Annotated[int | None, _parsed("COUNT", int), shown_as("COUNT")]
 MaybePath = Annotated[Path | None, _parsed("PATH", path_of), shown_as("PATH")]
 MaybeLength = Annotated[float | None, _parsed("LENGTH", length_of), shown_as("LENGTH")]
 # A checkout's root; of an installed package, a folder without pyproject.toml.
@@ -87,7 +87,7 @@ def numbers_of(option: str, text: str, form: str, *, are_lengths: bool = True) -
     except ValueError:
         numbers = ()
     if not (numbers and all(abs(number) < NUMBER_LARGEST for number in numbers)):
-        units = ", lengths such as 5mm or 0.005 (metres)" if are_lengths else ""
+        units = ": lengths such as 5mm or 0.005 (metres), sites and ratios without a unit" if are_lengths else ""
         raise ValueError(
             f"{option} is {text!r}; the form is {form}, numbers below {NUMBER_LARGEST:g} with commas and no "
             f"blanks{units}"

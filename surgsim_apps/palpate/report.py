@@ -84,8 +84,7 @@ def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: P
         ],
         map_picture=Picture.of_file(maps, "Stiffness, and force over depth", map_caption),
         organ_picture=Picture.of_file(organ, "The organ with the probe", organ_caption),
-        press=_press_rows(palpation),
-        run=_run_rows(palpation),
+        settings=_settings(palpation),
         command=command,
     )
     path.write_text(page, encoding="utf-8", newline="\n")
@@ -114,40 +113,27 @@ def _lesion_rows(palpation: PalpationResult) -> Rows:
     return rows
 
 
-def _press_rows(palpation: PalpationResult) -> Rows:
-    scene, presses = palpation.anatomy.scene, palpation.presses
-    tip, depth = scene.instrument.tip_radius, scene.palpation.press_depth
+def _settings(palpation: PalpationResult) -> Rows:
+    """Rows of instrument, presses, organ and program."""
+    scene, presses, mesh = palpation.anatomy.scene, palpation.presses, palpation.anatomy.mesh
+    tip, depth, material = scene.instrument.tip_radius, scene.palpation.press_depth, scene.material
     forces = np.array([press.force for press in presses])[palpation.used]
     share = hidden_share(float(forces.max()), tip, depth, scene.contact.stiffness)
-    loads = [press.load for press in presses]
+    towards = ", ".join(f"{value:.3g}" for value in scene.instrument.approach)
+    strain, pressure = (max(getattr(press.load, name) for press in presses) for name in ("strain", "pressure"))
     return [
-        ("tip and press", f"ball of {tip * 1e3:g} mm radius, {depth * 1e3:g} mm deep"),
-        ("approach", ", ".join(f"{value:.3g}" for value in scene.instrument.approach)),
+        ("press", f"ball of {tip * 1e3:g} mm radius, {depth * 1e3:g} mm deep, towards {towards}"),
         ("sites", f"{len(presses)}, {scene.palpation.site_spacing * 1e3:g} mm apart"),
         ("force held at the end", f"{forces.min():.3f} to {forces.max():.3f} N, median {np.median(forces):.3f} N"),
-        ("peak force", f"{max(press.force_peak for press in presses):.3f} N"),
-        ("largest strain and pressure", f"{max(load.strain for load in loads):.2f}, "
-                                        f"{max(load.pressure for load in loads) / 1e3:.1f} kPa"),
+        ("largest strain and pressure", f"{strain:.2f}, {pressure / 1e3:.1f} kPa"),
         ("contrast over 1 that contact hides", f"about {share:.1%} at the largest force"),
         ("hold", "no complete press" if palpation.hold is None else palpation.hold.text),
-    ]  # fmt: skip
-
-
-def _run_rows(palpation: PalpationResult) -> Rows:
-    mesh, scene = palpation.anatomy.mesh, palpation.anatomy.scene
-    material, factor = scene.material, palpation.model_modulus_factor
-    steps = f"{scene.timing.substep_count} substeps in a haptic step of {scene.timing.haptic_step * 1e3:g} ms"
-    return [
-        ("scene", scene.name),
-        ("organ", f"{mesh.node_count} nodes, {mesh.tet_count} tets"),
+        ("organ", f"{mesh.node_count} nodes, {mesh.tet_count} tets, healthy tissue of {material.youngs_modulus:g} Pa"),
         (
-            "healthy tissue",
-            f"Young's modulus {material.youngs_modulus:g} Pa, Poisson's ratio {material.poisson_ratio:g}",
+            "pre-operative model",
+            f"modulus {palpation.model_modulus_factor:.3f} of the organ's, sites {MODEL_SITE_ERROR * 1e3:g} mm off",
         ),
-        ("pre-operative model", f"modulus {factor:.3f} of the organ's, sites {MODEL_SITE_ERROR * 1e3:g} mm off"),
-        ("sensor", f"noise {scene.sensor.noise:g} N"),
-        ("time", f"{palpation.simulated_time:.1f} s simulated in {palpation.wall_time:.1f} s; {steps}"),
-        ("seed", str(palpation.seed)),
+        ("noise of the sensor", f"{scene.sensor.noise:g} N"),
         ("versions", f"surgsim {surgsim_version()}, Python {platform.python_version()}, numpy {np.__version__}"),
     ]
 

@@ -64,19 +64,22 @@ def check_options(options: SceneOptions) -> None:
         raise ValueError(f"--youngs-modulus is {modulus:g} Pa; it must be finite and above 0")
 
 
-def require_length(option: str, length: float | None, most: float = math.inf, body: str = "") -> None:
-    """Refuse a length [m] that is not above 0, not finite, or above `most` [m], that of a body.
+def require_length(
+    option: str, length: float | None, most: float = math.inf, body: str = "", least: float = 0.0
+) -> None:
+    """Refuse a length [m] that is not above 0, not finite, below `least`, or above `most`, that of a body.
 
     Raises:
         ValueError: names the option and the value; of metres instead of millimetres it says so.
     """
-    if length is None or (0.0 < length <= most and length < math.inf):
+    if length is None or (0.0 < length < math.inf and least <= length <= most):
         return
     if not 0.0 < length < math.inf:
         raise ValueError(f"{option} is {length:g} m; it must be finite and above 0")
     # A number without its unit.
     hint = f"; did you mean {length:g}mm?" if length >= 0.1 and length * 1e-3 <= most else ""
-    raise ValueError(f"{option} is {length:g} m; the rule is at most {most:.3g} m, {body}{hint}")
+    rule = f"{least:.2g} to" if least else "at most"
+    raise ValueError(f"{option} is {length:g} m; the rule is {rule} {most:.3g} m, {body}{hint}")
 
 
 def check_lengths(anatomy: Anatomy, around: Ball | None = None) -> None:
@@ -87,19 +90,13 @@ def check_lengths(anatomy: Anatomy, around: Ball | None = None) -> None:
     """
     scene, points = anatomy.scene, anatomy.mesh.points
     side, thickness = float(np.ptp(points, axis=0).max()), float(np.ptp(matmul(points, anatomy.face.approach)))
-    require_length("--press-depth", scene.palpation.press_depth, thickness, "the organ along the approach")
-    least, depth = DEPTH_LEAST * scene.instrument.tip_radius, scene.palpation.press_depth
-    if depth < least:
-        raise ValueError(f"--press-depth is {depth:g} m; the rule is at least {least:g} m with this tip")
-    require_length("the tip radius", scene.instrument.tip_radius, side, "the organ's longest side")
-    require_length("--around", around.radius if around else None, side, "the organ's longest side")
-    spacing = scene.palpation.site_spacing
-    require_length("--spacing", spacing, side, "the organ's longest side")
-    least = side / math.sqrt(SITES_MOST)
-    if spacing < least:
-        raise ValueError(
-            f"--spacing is {spacing:g} m; the rule is at least {least:.2g} m on this organ, some {SITES_MOST} sites"
-        )
+    palpation, tip = scene.palpation, scene.instrument.tip_radius
+    body, depth_least = "the organ along the approach", DEPTH_LEAST * tip
+    require_length("--press-depth", palpation.press_depth, thickness, body, depth_least)
+    body, spacing_least = "the organ's longest side", side / math.sqrt(SITES_MOST)
+    require_length("the tip radius", tip, side, body)
+    require_length("--around", around.radius if around else None, side, body)
+    require_length("--spacing", palpation.site_spacing, side, body, spacing_least)
 
 
 def _direction(vector: Vector) -> Vector:

@@ -111,14 +111,10 @@ def check_touch(volume: float, options: SceneOptions, cell_size: float | None) -
     """
     # A broken surface may enclose nothing; its mesher refuses it.
     most = float(cbrt(volume)) if volume > 0.0 else math.inf
+    least = max(LENGTH_LEAST * most, DEPTH_STEP) if volume > 0.0 else 0.0
     lengths = {"cell-size": cell_size, "tip-radius": options.tip_radius, "press-depth": options.press_depth}
     for option, length in lengths.items():
-        require_length(f"--{option}", length, most, "the edge of a cube of the organ's volume")
-        least = max(LENGTH_LEAST * most, DEPTH_STEP) if volume > 0.0 else 0.0
-        if length is not None and length < least:
-            raise ValueError(
-                f"--{option} is {length:g} m; the rule is at least {least:.2g} m for an organ of this volume"
-            )
+        require_length(f"--{option}", length, most, "the edge of a cube of the organ's volume", least)
 
 
 def tip_for_cells(cell_size: float) -> float:

@@ -86,13 +86,20 @@ def output_folder(
 
 
 @contextlib.contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """Temporary place of a new folder, to be made in a `with`; it appears at its end, after an error it does not."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with _room_in(folder), tempfile.TemporaryDirectory(prefix=PART, dir=folder.parent) as part:
-        place = Path(part, folder.name)
-        yield place
-        place.rename(folder)
+def new_folder(folder: Path) -> Iterator[None]:
+    """Removal of a new folder, made in a `with`, after an error.
+
+    Raises:
+        FileExistsError: the folder exists before.
+    """
+    if folder.exists():
+        raise FileExistsError(f"{folder} is there already: remove it, or name another folder")
+    try:
+        with _room_in(folder):
+            yield
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 @contextlib.contextmanager

@@ -50,8 +50,8 @@ class ScoringOptions:
         seeds = self._seeds
         if self.episodes is not None and not 1 <= self.episodes <= len(seeds):
             raise ValueError(f"--episodes is {self.episodes}; there are 1 to {len(seeds)} seeds")
-        if not isinstance(self.env_kwargs, dict):
-            raise ValueError(f"--env-arguments is {self.env_arguments!r}; it must be a JSON object")
+        # Refuses another text.
+        _ = self.env_kwargs
 
     @cached_property
     def played_seeds(self) -> tuple[int, ...]:
@@ -71,4 +71,10 @@ class ScoringOptions:
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:
         """`env_arguments` as a dictionary."""
-        return json.loads(self.env_arguments)
+        try:
+            arguments = json.loads(self.env_arguments)
+        except ValueError:
+            arguments = None
+        if not isinstance(arguments, dict):
+            raise ValueError(f"--env-arguments is {self.env_arguments!r}; it must be a JSON object")
+        return arguments

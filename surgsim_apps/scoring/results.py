@@ -95,6 +95,7 @@ def load_result(path: Path) -> Result:
     """Read a file of `Result.save`.
 
     Raises:
+        OSError: an unreadable file.
         ValueError: another content (names the file and the fault).
     """
     checked_content(path)
@@ -105,7 +106,7 @@ def load_result(path: Path) -> Result:
             for name, values in table["figures"].items()
         }
         return Result(**{**table, "seeds": read_seeds(table["seeds"])})
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path} is no result of surgsim evaluate: {type(error).__name__}: {reason}") from None
 

@@ -100,8 +100,9 @@ def _tuples_in(*hints: Any) -> Iterator[Any]:
 
 def nearest(name: str, known: list[str]) -> str:
     """Hint at the most similar known name; empty if none is similar."""
-    matches = get_close_matches(name, known, n=1)
-    return f"; did you mean {matches[0]!r}?" if matches else ""
+    folded = {other.casefold(): other for other in known}
+    matches = get_close_matches(name.casefold(), folded, n=1)
+    return f"; did you mean {folded[matches[0]]!r}?" if matches else ""
 
 
 def require_known(kind: str, name: object, known: Iterable[str]) -> None:

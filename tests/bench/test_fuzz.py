@@ -46,8 +46,8 @@ def test_a_seed_gives_its_input_again(name):
     assert sum(files not in fuzz.valid_inputs(kind) for files, _ in inputs[0]) >= 18
 
 
-def test_a_worker_that_ended_is_a_finding(tmp_path):
-    worker = fuzz.Worker(["csv"], str(tmp_path))
+def test_a_worker_that_ended_is_a_finding():
+    worker = fuzz.Worker(["csv"])
     try:
         worker.process.kill()
         worker.process.join()

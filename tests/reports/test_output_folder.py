@@ -1,5 +1,6 @@
 """Results of commands appear at the end, and after an error none does."""
 
+import contextlib
 import errno
 import itertools
 import os
@@ -99,17 +100,17 @@ def test_a_full_disk_is_named(tmp_path, number, place, writing):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_new_folder_appears_whole_or_not_at_all(tmp_path):
+def test_a_new_folder_stays_whole_or_not_at_all(tmp_path):
+    place = tmp_path / "deep" / "set"
     for error in (KeyboardInterrupt, None):
-        try:
-            with new_folder(tmp_path / "deep" / "set") as place:
-                place.mkdir()
-                (place / "a").write_text("a", encoding="utf-8")
-                assert not (tmp_path / "deep" / "set").exists()
-                if error:
-                    raise error
-        except KeyboardInterrupt:
-            assert not content(tmp_path)
+        with contextlib.suppress(KeyboardInterrupt), new_folder(place):
+            place.mkdir(parents=True)
+            (place / "a").write_text("a", encoding="utf-8")
+            if error:
+                raise error
+        assert content(tmp_path) == ({} if error else {"deep/set/a": "a"})
+    with pytest.raises(FileExistsError), new_folder(place):
+        pass
     assert content(tmp_path) == {"deep/set/a": "a"}
 
 

@@ -2,9 +2,11 @@
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -80,6 +82,9 @@ def make_patient(
         moduli: Young's modulus of regions by name [Pa].
         progress: display of the steps.
 
+    Warns:
+        UserWarning: remarks on the files and on the organ, when they arise; they are its notes, too.
+
     Raises:
         MeshError: a file that cannot become an organ.
         ValueError: arguments that do not go together, or values out of range.
@@ -95,13 +100,14 @@ def make_patient(
         if wrong:
             raise ValueError(f"{wrong[0]}: is no label image; beside {first} only other label images are taken")
         named = parse_labels(labels, file_count=len(files)) if labels is not None else None
-        with progress.step(f"reading {source}"):
+        with progress.step(f"reading {source}"), _noted() as notes:
             contents = read_label_image(first, named, others=files[1:])
+            _warn(contents.notes)
         name, volume = contents.names[0], image_volume(contents)
     elif first.suffix.lower() in FORMATS:
         if len(files) > 1:
             raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
-        with progress.step(f"reading {first.name}"):
+        with progress.step(f"reading {first.name}"), _noted() as notes:
             tags = parse_labels(labels, zero_is_outside=False) if labels is not None else ()
             contents = read_tets(first, length_unit, tags, cell_data)
             if remesh:
@@ -116,7 +122,7 @@ def make_patient(
             raise ValueError(
                 f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
             )
-        with progress.step(f"reading {first.name}"):
+        with progress.step(f"reading {first.name}"), _noted() as notes:
             contents = read_surfaces(files, length_unit, mend=mend)
         name, volume = contents.organ.name, contents.volume
     check_touch(volume, options, cell_size)
@@ -138,10 +144,33 @@ def make_patient(
         options, cells = replace(options, approach=approach), replace(cells, approach=approach)
     with progress.step("filling it with tets"):
         mesh = _meshed(contents, source, cells, mesher, mend)
+        _warn(mesh.notes)
     with progress.step("fitting its own surface to the tets"):
         mesh = replace(mesh, surface=_own_surface(contents, mesh, mend))
     with progress.step("choosing sites, lesions and the step"):
-        return patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
+        organ = patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
+        _warn(organ.notes)
+        return replace(organ, notes=(*notes, *mesh.notes, *organ.notes))
+
+
+@contextmanager
+def _noted() -> Iterator[list[str]]:
+    """Texts of the warnings within, for the report; they are shown when they arise."""
+    notes, show = list[str](), warnings.showwarning
+
+    def note(message: Warning | str, *place: Any) -> None:
+        notes.append(str(message))
+        show(message, *place)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = note
+        yield notes
+
+
+def _warn(notes: Iterable[str]) -> None:
+    for note in notes:
+        warnings.warn(note, stacklevel=3)
 
 
 def with_hold(organ: PatientScene, progress: StepProgress) -> PatientScene:
@@ -151,6 +180,7 @@ def with_hold(organ: PatientScene, progress: StepProgress) -> PatientScene:
         quick = with_added_mass(organ.anatomy, lambda anatomy: [anatomy.organ()])
         hold = check_hold(quick, sites, normals, progress=lambda: advance(1))
     faults = ("no press of the healthy organ reached its depth",) if hold is None else hold.faults
+    _warn(faults)
     return replace(organ, hold=hold, notes=(*organ.notes, *faults))
 
 
@@ -284,7 +314,7 @@ def check_target(out: Path) -> None:
 
 
 def print_patient(organ: PatientScene, console: Console) -> None:
-    """Print a summary of a patient's organ, and its notes as warnings."""
+    """Print a summary of a patient's organ."""
     patient, scene, cell = organ.patient, organ.scene, organ.anatomy.palpable_cell
     title = ", ".join(patient.sources)
     touch = (scene.instrument.tip_radius, scene.palpation.press_depth)
@@ -306,5 +336,3 @@ def print_patient(organ: PatientScene, console: Console) -> None:
         table.add_row(name, value)
     console.print(table)
     warn_of_coarse_cells(title, cell, *touch)
-    for note in (*patient.notes, *organ.notes):
-        warnings.warn(note, UserWarning, stacklevel=2)

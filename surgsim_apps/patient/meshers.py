@@ -203,7 +203,7 @@ def _mesh_labels(
         mesher=mesher,
         convention=CONVENTION,
         sources=(source,),
-        notes=(*image.notes, *labels.notes),
+        notes=labels.notes,
         is_scan=True,
     )
 
@@ -236,13 +236,11 @@ class PatientSurfaces:
         organ: closed, or broken and to be mended
         inner: of the regions, in their order
         sources: names of the files
-        notes: remarks on dropped parts
     """
 
     organ: ClosedSurface | BrokenSurface
     inner: tuple[ClosedSurface, ...]
     sources: tuple[str, ...]
-    notes: tuple[str, ...]
 
     @property
     def volume(self) -> float:
@@ -258,7 +256,7 @@ def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool)
         length_unit: of all files.
         mend: rebuild an organ's surface that is open or crosses itself from voxels.
     """
-    organ, dropped = read_organ_surface(files[0], length_unit, mend=mend)
+    organ = read_organ_surface(files[0], length_unit, mend=mend)
     inner = []
     for file in files[1:]:
         inner += read_region_surfaces(file, length_unit, region_name(file))
@@ -266,7 +264,7 @@ def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool)
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise MeshError(f"region {twice!r} is given twice; give the files other names")
-    return PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files), tuple(dropped))
+    return PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files))
 
 
 def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
@@ -285,7 +283,7 @@ def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> Pa
         graded = {"fine_triangles": facing, "fine_depth": cells.fine_depth}
 
     def make(cell_size: float) -> PatientMesh:
-        notes = list(surfaces.notes)
+        notes = []
         if isinstance(organ, BrokenSurface):
             tags, step, start, note = mended_voxels(organ, cell_size)
             notes.append(note)

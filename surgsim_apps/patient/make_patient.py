@@ -95,36 +95,33 @@ def make_patient(
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
     check_options(options)
     first, source = files[0], ", ".join(file.name for file in files)
-    if is_image(first):
-        wrong = [file for file in files if not is_image(file)]
-        if wrong:
-            raise ValueError(f"{wrong[0]}: is no label image; beside {first} only other label images are taken")
-        named = parse_labels(labels, file_count=len(files)) if labels is not None else None
-        with progress.step(f"reading {source}"), _noted() as notes:
+    with progress.step(f"reading {source}"), _noted() as notes:
+        if is_image(first):
+            wrong = [file for file in files if not is_image(file)]
+            if wrong:
+                raise ValueError(f"{wrong[0]}: is no label image; beside {first} only other label images are taken")
+            named = parse_labels(labels, file_count=len(files)) if labels is not None else None
             contents = read_label_image(first, named, others=files[1:])
             _warn(contents.notes)
-        name, volume = contents.names[0], image_volume(contents)
-    elif first.suffix.lower() in FORMATS:
-        if len(files) > 1:
-            raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
-        with progress.step(f"reading {first.name}"), _noted() as notes:
+        elif first.suffix.lower() in FORMATS:
+            if len(files) > 1:
+                raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
             tags = parse_labels(labels, zero_is_outside=False) if labels is not None else ()
             contents = read_tets(first, length_unit, tags, cell_data)
             if remesh:
                 contents = surfaces_of_tets(contents)
-        name = contents.organ.name if isinstance(contents, PatientSurfaces) else contents.names[0]
-        volume = contents.volume
-    else:
-        wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
-        if wrong:
-            raise ValueError(f"{wrong[0]}: is no surface; beside {first} only {', '.join(SURFACE_SUFFIXES)} are taken")
-        if length_unit is None:
-            raise ValueError(
-                f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
-            )
-        with progress.step(f"reading {first.name}"), _noted() as notes:
+        else:
+            wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
+            if wrong:
+                raise ValueError(
+                    f"{wrong[0]}: is no surface; beside {first} only {', '.join(SURFACE_SUFFIXES)} are taken"
+                )
+            if length_unit is None:
+                raise ValueError(
+                    f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
+                )
             contents = read_surfaces(files, length_unit, mend=mend)
-        name, volume = contents.organ.name, contents.volume
+    volume = image_volume(contents) if isinstance(contents, LabelImage) else contents.volume
     check_touch(volume, options, cell_size)
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
     if isinstance(contents, PatientTets):
@@ -134,9 +131,9 @@ def make_patient(
         )
     else:
         touch = plan_touch(volume, options, cell_size=cell_size, graded=mesher == MESHERS[0])
-    progress.say(plan_text(touch, organ_material(name, options.youngs_modulus).material, approach))
+    progress.say(plan_text(touch, organ_material(contents.names[0], options.youngs_modulus).material, approach))
     cells = Cells(touch.cell_size, touch.is_given, touch.coarsening, touch.fine_depth, approach, angle)
-    if options.approach is None and touch.coarsening > 1 and _has_lesions(contents):
+    if options.approach is None and touch.coarsening > 1 and any(map(is_lesion, contents.names[1:])):
         # The lesions decide the probe's approach, and that the place of the fine cells.
         with progress.step("turning the probe to the lesions"):
             rough = replace(cells, size=touch.coarsening * touch.cell_size, is_given=True, coarsening=1)
@@ -199,11 +196,6 @@ def _own_surface(contents: OrganContents, mesh: PatientMesh, mend: bool) -> Surf
     if isinstance(contents, PatientSurfaces):
         return file_surface(contents, mesh)
     return image_surface(contents, mesh, mend=mend)
-
-
-def _has_lesions(contents: OrganContents) -> bool:
-    names = [region.name for region in contents.inner] if isinstance(contents, PatientSurfaces) else contents.names[1:]
-    return any(map(is_lesion, names))
 
 
 def add_retraction(organ: PatientScene, out: Path) -> tuple[PatientScene, RetractScene | str]:

@@ -243,6 +243,11 @@ class PatientSurfaces:
     sources: tuple[str, ...]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the regions, the organ's own first."""
+        return tuple(surface.name for surface in (self.organ, *self.inner))
+
+    @property
     def volume(self) -> float:
         """Volume inside the organ's surface [m^3]."""
         return abs(surface_volume(self.organ.vertices, self.organ.triangles))
@@ -260,11 +265,11 @@ def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool)
     inner = []
     for file in files[1:]:
         inner += read_region_surfaces(file, length_unit, region_name(file))
-    names = [organ.name, *(surface.name for surface in inner)]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    surfaces = PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files))
+    twice = next((name for name in surfaces.names if surfaces.names.count(name) > 1), None)
     if twice is not None:
         raise MeshError(f"region {twice!r} is given twice; give the files other names")
-    return PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files))
+    return surfaces
 
 
 def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
@@ -275,8 +280,7 @@ def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> Pa
         cells: of the mesh.
         mesher: "lattice" or "tetwild".
     """
-    organ, inner = surfaces.organ, surfaces.inner
-    names = [organ.name, *(surface.name for surface in inner)]
+    organ, inner, names = surfaces.organ, surfaces.inner, surfaces.names
     graded: dict[str, Any] = {}
     if cells.coarsening > 1 and isinstance(organ, ClosedSurface):
         facing = outward_facing(organ.vertices, organ.triangles, cells.approach, cells.face_angle_deg)

@@ -67,8 +67,11 @@ def test_surfaces_of_tets_enclose_the_same_volumes(tmp_path):
 def test_a_scene_is_made_of_tets(tmp_path):
     file, out = tmp_path / "organ.vtu", tmp_path / "made" / "patient.vtu"
     write_mesh(file, block(((3, "kidney"), (7, "tumour"))))
-    assert main(["organ", str(file), "--no-healthy-map", "--out", str(out)]) == 0
+    assert main(["organ", str(file), "--length-unit", "0.9", "--no-healthy-map", "--out", str(out)]) == 0
     assert {path.name for path in out.parent.iterdir()} >= {"patient.vtu", "patient.toml", "report.html"}
+    for name in ("patient.toml", "report.html"):
+        # The file states metres.
+        assert "length_unit says 0.9" in (out.parent / name).read_text()
     scene = load_scene(out.with_suffix(".toml"))
     assert [(region.name, region.lesion) for region in scene.regions] == [("tumour", True)]
     anatomy = load_anatomy(scene)

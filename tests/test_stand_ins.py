@@ -31,7 +31,12 @@ READERS = {
 @pytest.mark.parametrize("ending", READERS)
 @pytest.mark.parametrize(
     ("text", "content"),
-    [(LFS, "git lfs pull"), ("<!DOCTYPE html>\n<html>", "web page"), ("/annex/objects/MD5E-s1--0.stl\n", "annex get")],
+    [
+        (LFS, "git lfs pull"),
+        ("<!DOCTYPE html>\n<html>", "web page"),
+        (" \n<html>", "web page"),
+        ("/annex/objects/MD5E-s1--0.stl\n", "annex get"),
+    ],
 )
 def test_a_stand_in_is_named(tmp_path, ending, text, content):
     file = tmp_path / f"a{ending}"

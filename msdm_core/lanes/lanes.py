@@ -29,7 +29,7 @@ from msdm_core.kernels.structure_kernels import (
     ToolResponse,
 )
 from msdm_core.kernels.vector_kernels import aligned_zeros, lane_counts
-from msdm_core.mesh.tet_mesh import TET_FACES
+from msdm_core.mesh.tet_mesh import outer_faces
 from msdm_core.organ.state import field_sizes, state_sizes, zero_state
 from msdm_core.organ.stepping import unyielding
 
@@ -100,9 +100,7 @@ def _lane_zeros(field: Field, sizes: Mapping[int | str, int], lanes: int, dtype:
 
 def surface_rooms(organ: OrganModel) -> dict[int | str, int]:
     """Largest numbers of rows of an organ of these tets with any anchors, by name."""
-    faces = np.sort(organ.tet_nodes[:, TET_FACES].reshape(-1, 3), axis=1)
-    outer, times = np.unique(faces, axis=0, return_counts=True)
-    outer = outer[times == 1]
+    outer, _ = outer_faces(organ.tet_nodes)
     return {
         "n_surface": len(outer),
         "n_support_node": len(np.unique(outer)) if len(organ.support_kind) else 0,

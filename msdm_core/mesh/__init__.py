@@ -13,7 +13,7 @@ from msdm_core.mesh.surface import (
     surface_volume,
     triangle_lattice,
 )
-from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray, TetMesh, used_nodes
+from msdm_core.mesh.tet_mesh import TET_FACES, FloatArray, IntArray, TetMesh, connected_tets, outer_faces, used_nodes
 
 __all__ = [
     "TET_FACES",
@@ -23,6 +23,7 @@ __all__ = [
     "SurfaceDistance",
     "TetMesh",
     "check_surface",
+    "connected_tets",
     "dihedral_angles",
     "find_carriers",
     "in_sweep_order",
@@ -30,6 +31,7 @@ __all__ = [
     "merge_vertices",
     "mesh_quality",
     "node_normals",
+    "outer_faces",
     "outward_facing",
     "surface_carriers",
     "surface_cell",

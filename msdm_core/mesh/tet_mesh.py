@@ -139,11 +139,8 @@ class TetMesh:
 
     @cached_property
     def _boundary(self) -> tuple[IntArray, IntArray]:
-        faces = self.tets[:, TET_FACES].reshape(-1, 3)
-        ordered = np.sort(faces, axis=1)
-        _, first, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
-        outer = np.sort(first[counts == 1])
-        return _frozen(faces[outer].astype(np.int32)), _frozen((outer // 4).astype(np.int32))
+        faces, tets = outer_faces(self.tets)
+        return _frozen(faces), _frozen(tets)
 
     @cached_property
     def boundary_nodes(self) -> IntArray:
@@ -162,6 +159,14 @@ def tet_volumes(points: FloatArray, tets: NDArray[np.integer]) -> FloatArray:
     """Signed volume of each tet, V = (b - a) . ((c - a) x (d - a)) / 6 [m^3], shape (n_tet,)."""
     a, b, c, d = (points[tets[:, corner]] for corner in range(4))
     return dot(b - a, np.cross(c - a, d - a)) / 6.0
+
+
+def outer_faces(tets: NDArray[np.integer]) -> tuple[IntArray, IntArray]:
+    """Faces of a single tet each, (n, 3), outward for positive tets, and these tets, (n,)."""
+    faces = tets[:, TET_FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = np.sort(first[count == 1])
+    return faces[outer].astype(np.int32), (outer // 4).astype(np.int32)
 
 
 def used_nodes(points: FloatArray, tets: NDArray[np.integer]) -> tuple[FloatArray, NDArray[np.integer]]:

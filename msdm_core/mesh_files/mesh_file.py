@@ -26,6 +26,7 @@ STAND_INS = {
     b"version https://git-lfs.github.com/spec/": "a Git LFS pointer: git lfs pull",
     b"/annex/objects/": "a git-annex pointer: git annex get",
     b"<!doctype html": "a web page: download the file itself",
+    b"<html": "a web page: download the file itself",
 }
 
 # Beginnings of the formats, tried in this order.
@@ -50,7 +51,7 @@ def checked_content(path: Path) -> Path:
         MeshError: a pointer of Git LFS or git-annex, or a web page, in place of the file.
     """
     with contextlib.suppress(OSError), path.open("rb") as stream:
-        head = stream.read(64).lower()
+        head = stream.read(64).lower().lstrip(b"\xef\xbb\xbf \r\n\t")
         for start, content in STAND_INS.items():
             if head.startswith(start):
                 raise MeshError(f"{path} is {content}")

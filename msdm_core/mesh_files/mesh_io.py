@@ -30,7 +30,8 @@ _GEOMETRY_KEY = "gmsh:geometrical"
 TAGS_MOST = 255
 
 _CONVERT = "convert it, for instance: meshio convert IN OUT.vtu, or gmsh IN -save -format msh22 -o OUT.msh"
-_SAVE = {"vtu": "save it again as .vtu (ParaView)", "gmsh": "write it again: gmsh IN -save -format msh22 -o OUT.msh"}
+_SAVE = {".vtu": "save it again as .vtu (ParaView)", ".msh": "write it again: gmsh IN -save -format msh22 -o OUT.msh"}
+_SAVE |= {".vtk": _SAVE[".vtu"], ".mesh": _SAVE[".msh"]}
 _VOLUME_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 
 UNIT_KEY = "length_unit_m"
@@ -57,14 +58,14 @@ def read_mesh(path: str | Path, *, length_unit: LengthUnit | None = None, cell_d
     """
     asked = None if length_unit is None else metres_per_unit(length_unit)
     file = checked_file(path, FORMATS, _CONVERT)
-    if file.suffix.lower() == ".vtu":
+    suffix = file.suffix.lower()
+    if suffix == ".vtu":
         _check_pieces(file)
-    file_format = FORMATS[file.suffix.lower()]
-    raw, groups = parsed(file, _READERS[file_format], _SAVE["gmsh" if file_format in ("gmsh", "medit") else "vtu"])
+    raw = parsed(file, _read_gmsh if suffix == ".msh" else partial(_read_meshio, FORMATS[suffix]), _SAVE[suffix])
     metres = _chosen_unit(file, asked, float(raw.field_data[UNIT_KEY].flat[0]) if UNIT_KEY in raw.field_data else None)
     tets = _only_tets(file, raw)
     region = _region_of(file, raw, cell_data)
-    for entity, tags in groups.items():
+    for entity, tags in (raw.info or {}).items():
         if len(tags) > 1:
             text = ", ".join(map(str, tags))
             warnings.warn(f"{file}: volume {entity} is in the physical groups {text}: {tags[0]} is used", stacklevel=2)
@@ -99,15 +100,15 @@ def write_mesh(path: str | Path, mesh: TetMesh) -> None:
     file.write_bytes(head + mark + _field_data(mesh) + tail)
 
 
-def _read_meshio(file_format: str, path: str) -> tuple[Any, dict[int, list[int]]]:
+def _read_meshio(file_format: str, path: str) -> Any:
     """Mesh by the format's own meshio reader; meshio.read would print and call sys.exit on an error."""
     import meshio
 
-    return getattr(meshio, file_format).read(path), {}
+    return getattr(meshio, file_format).read(path)
 
 
-def _read_gmsh(path: str) -> tuple[Any, dict[int, list[int]]]:
-    """Mesh of a gmsh file, and the physical groups of each volume of version 4.1.
+def _read_gmsh(path: str) -> Any:
+    """Mesh of a gmsh file, of version 4.1 with the physical groups of each volume as `info`.
 
     meshio alone takes the first of several groups, and refuses a file with some volumes in no group.
     """
@@ -124,17 +125,15 @@ def _read_gmsh(path: str) -> tuple[Any, dict[int, list[int]]]:
             stream.readline()
             _, _, _, groups = _read_entities(stream, version[1] == b"0", int(version[2]))[0]
         scratch.write_bytes(head + rest.partition(b"$EndEntities")[2])
-        raw, _ = _read_meshio("gmsh", str(scratch))
+        raw = _read_meshio("gmsh", str(scratch))
+    raw.info = groups
     if any(groups.values()):
         raw.cell_data["gmsh:physical"] = [
             # A block is of one volume.
             np.full(len(volume), next(iter(groups[volume[0]]), 0) if block.type == "tetra" else 0)
             for block, volume in zip(raw.cells, raw.cell_data[_GEOMETRY_KEY], strict=True)
         ]
-    return raw, groups
-
-
-_READERS = {name: partial(_read_meshio, name) for name in FORMATS.values()} | {"gmsh": _read_gmsh}
+    return raw
 
 
 def _check_pieces(file: Path) -> None:
@@ -202,19 +201,21 @@ def _region_of(file: Path, raw: Any, asked: str | None) -> NDArray | None:
                 f"{file}: which cell data are the regions? Give cell_data (--cell-data): {', '.join(tags.values())}"
             )
         asked = next(iter(chosen or [name for name in REGION_KEYS if name in arrays]), None)
-        if chosen and chosen[0] not in REGION_KEYS:
+        usual = (*REGION_KEYS, _GEOMETRY_KEY)
+        others: list[str] = [tags.get(name) or name for name in arrays if name in tags or name not in usual]
+        convert = "of the nodes (ParaView: Point Data to Cell Data, Categorical Data)"
+        others += [f"{text} {convert}" for text in _tags_in(raw.point_data).values()]
+        if chosen and asked not in REGION_KEYS:
             warnings.warn(f"{file}: the regions are the cell data {tags[chosen[0]]}", stacklevel=3)
-        if not chosen and (of_nodes := _tags_in(raw.point_data)):
+        if not chosen and others:
             warnings.warn(
-                f"{file}: the point data {', '.join(of_nodes.values())} are left out: regions are cell data (ParaView: "
-                "Point Data to Cell Data, Categorical Data)",
+                f"{file}: not read as regions: {', '.join(others)}: name cell data with cell_data (--cell-data)",
                 stacklevel=3,
             )
         if asked is None:
             return None
     if asked not in arrays:
-        there = ", ".join(tags.values()) or ", ".join(arrays) or "none"
-        raise MeshError(f"{file}: has no cell data {asked!r}; there are {there}")
+        raise MeshError(f"{file}: has no cell data {asked!r}; there are {', '.join(arrays) or 'none'}")
     values = arrays[asked]
     return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 

@@ -65,10 +65,11 @@ def _whole(file: Path, data: bytes) -> bytes:
             there = min(max(len(data) - 84, 0) // 50, promised)
     elif b"format ascii" in head:
         noun, promised = "vertices, faces and others", sum(map(int, re.findall(rb"(?m)^element\s+\S+\s+(\d+)", head)))
-        there = sum(not line.isspace() for line in body.splitlines()[1:])
+        there = sum(bool(line.strip()) for line in body.splitlines()[1:])
     if promised != there:
         raise MeshError(
-            f"{file}: {promised} {noun} are promised and {there} are there: it is cut short or damaged: {_EXPORT}"
+            f"{file}: {promised} {noun} are promised and {there} are there: it is cut short, damaged or no "
+            f"{file.suffix} at all: {_EXPORT}"
         )
     if end < len(data):
         warnings.warn(f"{file}: {len(data) - end} bytes after its {promised} triangles are left out", stacklevel=3)

@@ -2,9 +2,11 @@
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -80,6 +82,9 @@ def make_patient(
         moduli: Young's modulus of regions by name [Pa].
         progress: display of the steps.
 
+    Warns:
+        UserWarning: remarks on the files and on the organ, when they arise; they are its notes, too.
+
     Raises:
         MeshError: a file that cannot become an organ.
         ValueError: arguments that do not go together, or values out of range.
@@ -90,35 +95,33 @@ def make_patient(
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
     check_options(options)
     first, source = files[0], ", ".join(file.name for file in files)
-    if is_image(first):
-        wrong = [file for file in files if not is_image(file)]
-        if wrong:
-            raise ValueError(f"{wrong[0]}: is no label image; beside {first} only other label images are taken")
-        named = parse_labels(labels, file_count=len(files)) if labels is not None else None
-        with progress.step(f"reading {source}"):
+    with progress.step(f"reading {source}"), _noted() as notes:
+        if is_image(first):
+            wrong = [file for file in files if not is_image(file)]
+            if wrong:
+                raise ValueError(f"{wrong[0]}: is no label image; beside {first} only other label images are taken")
+            named = parse_labels(labels, file_count=len(files)) if labels is not None else None
             contents = read_label_image(first, named, others=files[1:])
-        name, volume = contents.names[0], image_volume(contents)
-    elif first.suffix.lower() in FORMATS:
-        if len(files) > 1:
-            raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
-        with progress.step(f"reading {first.name}"):
+            _warn(contents.notes)
+        elif first.suffix.lower() in FORMATS:
+            if len(files) > 1:
+                raise ValueError(f"{first}: one file of tets is taken, {len(files)} are given")
             tags = parse_labels(labels, zero_is_outside=False) if labels is not None else ()
             contents = read_tets(first, length_unit, tags, cell_data)
             if remesh:
                 contents = surfaces_of_tets(contents)
-        name = contents.organ.name if isinstance(contents, PatientSurfaces) else contents.names[0]
-        volume = contents.volume
-    else:
-        wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
-        if wrong:
-            raise ValueError(f"{wrong[0]}: is no surface; beside {first} only {', '.join(SURFACE_SUFFIXES)} are taken")
-        if length_unit is None:
-            raise ValueError(
-                f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
-            )
-        with progress.step(f"reading {first.name}"):
+        else:
+            wrong = [file for file in files if file.suffix.lower() not in SURFACE_SUFFIXES]
+            if wrong:
+                raise ValueError(
+                    f"{wrong[0]}: is no surface; beside {first} only {', '.join(SURFACE_SUFFIXES)} are taken"
+                )
+            if length_unit is None:
+                raise ValueError(
+                    f'{first}: needs --length-unit: "m", "cm", "mm" or metres per unit; its format states none'
+                )
             contents = read_surfaces(files, length_unit, mend=mend)
-        name, volume = contents.organ.name, contents.volume
+    volume = image_volume(contents) if isinstance(contents, LabelImage) else contents.volume
     check_touch(volume, options, cell_size)
     approach, angle = approach_of(options, is_scan=is_image(first)), make_scene(PATTERN).palpation.face_angle_deg
     if isinstance(contents, PatientTets):
@@ -128,9 +131,9 @@ def make_patient(
         )
     else:
         touch = plan_touch(volume, options, cell_size=cell_size, graded=mesher == MESHERS[0])
-    progress.say(plan_text(touch, organ_material(name, options.youngs_modulus).material, approach))
+    progress.say(plan_text(touch, organ_material(contents.names[0], options.youngs_modulus).material, approach))
     cells = Cells(touch.cell_size, touch.is_given, touch.coarsening, touch.fine_depth, approach, angle)
-    if options.approach is None and touch.coarsening > 1 and _has_lesions(contents):
+    if options.approach is None and touch.coarsening > 1 and any(map(is_lesion, contents.names[1:])):
         # The lesions decide the probe's approach, and that the place of the fine cells.
         with progress.step("turning the probe to the lesions"):
             rough = replace(cells, size=touch.coarsening * touch.cell_size, is_given=True, coarsening=1)
@@ -138,10 +141,33 @@ def make_patient(
         options, cells = replace(options, approach=approach), replace(cells, approach=approach)
     with progress.step("filling it with tets"):
         mesh = _meshed(contents, source, cells, mesher, mend)
+        _warn(mesh.notes)
     with progress.step("fitting its own surface to the tets"):
         mesh = replace(mesh, surface=_own_surface(contents, mesh, mend))
     with progress.step("choosing sites, lesions and the step"):
-        return patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
+        organ = patient_scene(mesh, out, touch=touch, options=options, moduli=moduli or {})
+        _warn(organ.notes)
+        return replace(organ, notes=(*notes, *mesh.notes, *organ.notes))
+
+
+@contextmanager
+def _noted() -> Iterator[list[str]]:
+    """Texts of the warnings within, for the report; they are shown when they arise."""
+    notes, show = list[str](), warnings.showwarning
+
+    def note(message: Warning | str, *place: Any) -> None:
+        notes.append(str(message))
+        show(message, *place)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = note
+        yield notes
+
+
+def _warn(notes: Iterable[str]) -> None:
+    for note in notes:
+        warnings.warn(note, stacklevel=3)
 
 
 def with_hold(organ: PatientScene, progress: StepProgress) -> PatientScene:
@@ -151,6 +177,7 @@ def with_hold(organ: PatientScene, progress: StepProgress) -> PatientScene:
         quick = with_added_mass(organ.anatomy, lambda anatomy: [anatomy.organ()])
         hold = check_hold(quick, sites, normals, progress=lambda: advance(1))
     faults = ("no press of the healthy organ reached its depth",) if hold is None else hold.faults
+    _warn(faults)
     return replace(organ, hold=hold, notes=(*organ.notes, *faults))
 
 
@@ -169,11 +196,6 @@ def _own_surface(contents: OrganContents, mesh: PatientMesh, mend: bool) -> Surf
     if isinstance(contents, PatientSurfaces):
         return file_surface(contents, mesh)
     return image_surface(contents, mesh, mend=mend)
-
-
-def _has_lesions(contents: OrganContents) -> bool:
-    names = [region.name for region in contents.inner] if isinstance(contents, PatientSurfaces) else contents.names[1:]
-    return any(map(is_lesion, names))
 
 
 def add_retraction(organ: PatientScene, out: Path) -> tuple[PatientScene, RetractScene | str]:
@@ -284,7 +306,7 @@ def check_target(out: Path) -> None:
 
 
 def print_patient(organ: PatientScene, console: Console) -> None:
-    """Print a summary of a patient's organ, and its notes as warnings."""
+    """Print a summary of a patient's organ."""
     patient, scene, cell = organ.patient, organ.scene, organ.anatomy.palpable_cell
     title = ", ".join(patient.sources)
     touch = (scene.instrument.tip_radius, scene.palpation.press_depth)
@@ -306,5 +328,3 @@ def print_patient(organ: PatientScene, console: Console) -> None:
         table.add_row(name, value)
     console.print(table)
     warn_of_coarse_cells(title, cell, *touch)
-    for note in (*patient.notes, *organ.notes):
-        warnings.warn(note, UserWarning, stacklevel=2)

@@ -203,7 +203,7 @@ def _mesh_labels(
         mesher=mesher,
         convention=CONVENTION,
         sources=(source,),
-        notes=(*image.notes, *labels.notes),
+        notes=labels.notes,
         is_scan=True,
     )
 
@@ -236,13 +236,16 @@ class PatientSurfaces:
         organ: closed, or broken and to be mended
         inner: of the regions, in their order
         sources: names of the files
-        notes: remarks on dropped parts
     """
 
     organ: ClosedSurface | BrokenSurface
     inner: tuple[ClosedSurface, ...]
     sources: tuple[str, ...]
-    notes: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the regions, the organ's own first."""
+        return tuple(surface.name for surface in (self.organ, *self.inner))
 
     @property
     def volume(self) -> float:
@@ -258,15 +261,15 @@ def read_surfaces(files: Sequence[Path], length_unit: LengthUnit, *, mend: bool)
         length_unit: of all files.
         mend: rebuild an organ's surface that is open or crosses itself from voxels.
     """
-    organ, dropped = read_organ_surface(files[0], length_unit, mend=mend)
+    organ = read_organ_surface(files[0], length_unit, mend=mend)
     inner = []
     for file in files[1:]:
         inner += read_region_surfaces(file, length_unit, region_name(file))
-    names = [organ.name, *(surface.name for surface in inner)]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    surfaces = PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files))
+    twice = next((name for name in surfaces.names if surfaces.names.count(name) > 1), None)
     if twice is not None:
         raise MeshError(f"region {twice!r} is given twice; give the files other names")
-    return PatientSurfaces(organ, tuple(inner), tuple(file.name for file in files), tuple(dropped))
+    return surfaces
 
 
 def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> PatientMesh:
@@ -277,15 +280,14 @@ def mesh_surfaces(surfaces: PatientSurfaces, *, cells: Cells, mesher: str) -> Pa
         cells: of the mesh.
         mesher: "lattice" or "tetwild".
     """
-    organ, inner = surfaces.organ, surfaces.inner
-    names = [organ.name, *(surface.name for surface in inner)]
+    organ, inner, names = surfaces.organ, surfaces.inner, surfaces.names
     graded: dict[str, Any] = {}
     if cells.coarsening > 1 and isinstance(organ, ClosedSurface):
         facing = outward_facing(organ.vertices, organ.triangles, cells.approach, cells.face_angle_deg)
         graded = {"fine_triangles": facing, "fine_depth": cells.fine_depth}
 
     def make(cell_size: float) -> PatientMesh:
-        notes = list(surfaces.notes)
+        notes = []
         if isinstance(organ, BrokenSurface):
             tags, step, start, note = mended_voxels(organ, cell_size)
             notes.append(note)

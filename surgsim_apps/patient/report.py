@@ -63,7 +63,7 @@ def report_page(
         generator="surgsim organ",
         title=f"Organ: {organ.scene.description}",
         verdict=verdict(organ),
-        notes=[*organ.patient.notes, *organ.notes],
+        notes=organ.notes,
         source=_source(organ),
         volumes=_volumes(organ),
         organ_picture=Picture("From three sides", outside, organ_picture(organ)),
@@ -93,7 +93,7 @@ def verdict(organ: PatientScene) -> str:
     text += (
         f" {count} segmented lesion{'s are' if count != 1 else ' is'} in it." if count else " No lesion was segmented."
     )
-    remarks = len(patient.notes) + len(organ.notes)
+    remarks = len(organ.notes)
     return text + (f" {remarks} remark{'s' if remarks != 1 else ''} below." if remarks else "")
 
 

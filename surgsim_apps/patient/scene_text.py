@@ -22,7 +22,7 @@ def scene_text(organ: PatientScene) -> str:
         f"Mesh: {patient.mesher}, {patient.cells_text}.",
         f"Axes: {patient.convention}.",
         "Change any number here; surgsim organ replaces this file when it is run again with the same --out.",
-        *(f"Note: {note}" for note in (*patient.notes, *organ.notes)),
+        *(f"Note: {note}" for note in organ.notes),
     )
     comments = {
         "retract_scene": "used by the retraction environments",

@@ -1,6 +1,7 @@
 """Surfaces of an organ and its regions from STL, OBJ and PLY files, and the voxels inside them."""
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,10 +56,11 @@ def region_name(file: Path) -> str:
     return check_name(kept.strip(" .-") or "organ", str(file))
 
 
-def read_organ_surface(
-    file: Path, length_unit: LengthUnit, *, mend: bool
-) -> tuple[ClosedSurface | BrokenSurface, list[str]]:
-    """Largest body of a surface file, and notes on dropped ones.
+def read_organ_surface(file: Path, length_unit: LengthUnit, *, mend: bool) -> ClosedSurface | BrokenSurface:
+    """Largest body of a surface file.
+
+    Warns:
+        UserWarning: bodies that are left out, and the warnings of `read_surface`.
 
     Raises:
         MeshError: a surface that is open, crosses itself or is no manifold, unless `mend` is set.
@@ -69,33 +71,36 @@ def read_organ_surface(
     bodies, name = bodies_of(vertices, triangles.astype(np.int64)), region_name(file)
     try:
         closed = ClosedSurface(name, *check_surface(*bodies[0]))
-        return closed, _left_out(file, bodies, metres_per_unit(length_unit)) if len(bodies) > 1 else []
     except MeshError as error:
         if not mend:
             raise MeshError(f"{file}: {error}; or --mend rebuilds it from voxels") from None
-        return BrokenSurface(name, *merge_vertices(vertices, triangles), fault=str(error)), []
+        return BrokenSurface(name, *merge_vertices(vertices, triangles), fault=str(error))
+    if len(bodies) > 1:
+        warnings.warn(_left_out(file, bodies, metres_per_unit(length_unit)), stacklevel=2)
+    return closed
 
 
-def _left_out(file: Path, bodies: Sequence[tuple[FloatArray, Triangles]], metres: float) -> list[str]:
+def _left_out(file: Path, bodies: Sequence[tuple[FloatArray, Triangles]], metres: float) -> str:
     """Note on the bodies beside the first: names in the file, inside or outside of it, volumes."""
     import trimesh
 
     split: dict[str, Any] = {"split_objects": True, "split_groups": True}
     solids = trimesh.load_scene(file, process=False, skip_materials=True, **split).geometry
-    names = ["nameless"] * len(bodies)
-    for name, solid in solids.items() if len(solids) > 1 else ():
-        place = solid.vertices[solid.faces[0, 0]] * metres
-        distances = [np.square(vertices - place).sum(axis=1).min() for vertices, _ in bodies]
-        names[int(np.argmin(distances))] = repr(name)
-    shown = []
-    for name, body in list(zip(names, bodies, strict=True))[1:6]:
-        side = "inside" if _is_inside(body[0][0], *bodies[0]) else "outside"
-        shown.append(f"{name}, {side} it, {abs(surface_volume(*body)) * 1e6:.3g} ml")
-    return [
-        f"{file.name}: {len(bodies) - 1} surface(s) beside the largest ({names[0]}) were left out: {'; '.join(shown)}"
-        f"{'; ...' if len(bodies) > 6 else ''}; to make one a region, save it alone, named after the region, and give "
-        f"both: surgsim organ {file.name} NAME{file.suffix}"
+
+    def name(place: FloatArray) -> str:
+        distances = {solid: np.abs(mesh.vertices * metres - place).sum(axis=1).min() for solid, mesh in solids.items()}
+        return repr(min(distances, key=distances.__getitem__)) if len(distances) > 1 else "nameless"
+
+    shown = [
+        f"{name(body[0][0])}, {'inside' if _is_inside(body[0][0], *bodies[0]) else 'outside'} it, "
+        f"{abs(surface_volume(*body)) * 1e6:.3g} ml"
+        for body in bodies[1:6]
     ]
+    return (
+        f"{file.name}: {len(bodies) - 1} surface(s) beside the largest ({name(bodies[0][0][0])}) were left out: "
+        f"{'; '.join(shown)}{'; ...' if len(bodies) > 6 else ''}; to make one a region, save it alone, named after the "
+        f"region, and give both: surgsim organ {file.name} NAME{file.suffix}"
+    )
 
 
 def _is_inside(point: FloatArray, vertices: FloatArray, triangles: Triangles) -> bool:

@@ -6,16 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.errors import MeshError
 from msdm_core.mesh import (
-    TET_FACES,
     FloatArray,
     IntArray,
     TetMesh,
     check_surface,
+    connected_tets,
     in_sweep_order,
     merge_vertices,
+    outer_faces,
     outward_facing,
     surface_cell,
     used_nodes,
@@ -35,12 +37,10 @@ class PatientTets:
     Fields:
         mesh: tags from 1 on, the organ's own first, all of them named; in metres
         source: name of the file
-        notes: on what was left out, for the report
     """
 
     mesh: TetMesh
     source: str
-    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ class PatientTets:
 def read_tets(
     file: Path, length_unit: LengthUnit | None, labels: Sequence[LabelName], cell_data: str | None = None
 ) -> PatientTets:
-    """Tets of a file, with names for their regions; tag 0 is outside where others have names and it has none.
+    """Tets of a file, with names for their regions; nameless tets around them, and those of tag 0, are left out.
 
     Args:
         file: vtu, vtk, msh or mesh.
@@ -74,49 +74,55 @@ def read_tets(
         cell_data: name of the array with the tags, as in `read_mesh`.
 
     Raises:
-        MeshError: a file that is no organ, tags without names, names without tets.
+        MeshError: a file that is no organ, tags without names inside of the named ones, names without tets.
+
+    Warns:
+        UserWarning: tags that are left out, and the warnings of `read_mesh`.
     """
     from msdm_core.mesh_files import read_mesh
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        mesh = read_mesh(file, length_unit=length_unit, cell_data=cell_data)
-    notes = [str(entry.message) for entry in caught]
+    mesh = read_mesh(file, length_unit=length_unit, cell_data=cell_data)
     present = np.unique(mesh.region).tolist()
     named: dict[int | str, str] = (
         dict(mesh.region_names) if not labels else {label.value: label.name for label in labels}
     )
     if len(present) == 1 and not labels:
         named = {present[0]: named.get(present[0], region_name(file))}
-    nameless = [tag for tag in present if tag not in named]
-    if nameless == [0] and len(present) > 1:
-        outside = float(mesh.volumes[mesh.region == 0].sum())
-        notes.append(f"{file.name}: tets of tag 0 have no name and are left out as outside, {outside * 1e6:.4g} ml")
-        present, nameless = [tag for tag in present if tag], []
     known = ", ".join(map(str, present))
-    if nameless and len(present) > 1:
-        fault = (
-            f"{file}: regions {', '.join(map(str, nameless))} of {known} have no name: give --labels NAME=TAG,... with "
-            "the organ first, such as liver=1,lesion=2; tag 0 needs none, it is outside; take other tets that are no "
-            "tissue out of the file (ParaView: Threshold)"
-        )
-        raise MeshError("; ".join([fault, *notes]))
     absent = [f"{name}={tag}" for tag, name in named.items() if tag not in present]
     if absent and labels:
-        fault = f"{file}: --labels {','.join(absent)}: no tet has this tag; those there are {known}"
-        raise MeshError("; ".join([fault, *notes]))
+        raise MeshError(f"{file}: --labels {','.join(absent)}: no tet has this tag; the tags are {known}")
     order = [tag for tag in named if tag in present]
     if not labels:
         order.sort(key=lambda tag: -float(mesh.volumes[mesh.region == tag].sum()))
     tags = np.zeros(mesh.tet_count, dtype=np.int32)
     for number, tag in enumerate(order, start=1):
         tags[mesh.region == tag] = number
+    nameless = [tag for tag in _enclosed(mesh, tags == 0) if tag] if order else [tag for tag in present if tag]
+    if nameless:
+        raise MeshError(
+            f"{file}: the tags {', '.join(map(str, nameless))} of {known} have no name: give --labels NAME=TAG,... "
+            "with the organ first, such as liver=1,lesion=2; tags around the named ones need none"
+        )
+    outside = [tag for tag in present if tag not in order]
+    if outside:
+        sizes = [f"{tag} ({mesh.volumes[mesh.region == tag].sum() * 1e6:.4g} ml)" for tag in outside]
+        warnings.warn(f"{file}: tets of tag {', '.join(sizes)} have no name and are left out as outside", stacklevel=2)
     names = tuple((number, named[tag]) for number, tag in enumerate(order, start=1))
     try:
         kept = TetMesh(*used_nodes(mesh.points, mesh.tets[tags > 0]), tags[tags > 0], names)
     except MeshError as error:
-        raise MeshError(f"{file}, without the tets of tag 0: {error}") from None
-    return PatientTets(in_sweep_order(kept), file.name, tuple(notes))
+        raise MeshError(f"{file}, without the tets outside: {error}") from None
+    return PatientTets(in_sweep_order(kept), file.name)
+
+
+def _enclosed(mesh: TetMesh, chosen: NDArray[np.bool_]) -> list[int]:
+    """Tags of chosen tets (n_tet,) in parts away from the surface of the mesh."""
+    if not chosen.any():
+        return []
+    _, part = connected_tets(mesh.tets[chosen])
+    reaching = part[np.isin(np.flatnonzero(chosen), mesh.boundary_tets)]
+    return np.unique(mesh.region[chosen][~np.isin(part, reaching)]).tolist()
 
 
 def patient_of_tets(tets: PatientTets, cell_size: float) -> PatientMesh:
@@ -132,7 +138,7 @@ def patient_of_tets(tets: PatientTets, cell_size: float) -> PatientMesh:
         mesher="the file's tets",
         convention=FILE_CONVENTION,
         sources=(tets.source,),
-        notes=tets.notes,
+        notes=(),
         is_scan=False,
     )
 
@@ -147,11 +153,11 @@ def surfaces_of_tets(tets: PatientTets) -> PatientSurfaces:
     organ = ClosedSurface(names[0], *_closed(mesh.points, mesh.boundary_triangles, f"{tets.source}: {names[0]}"))
     inner = []
     for tag, name in mesh.region_names[1:]:
-        bodies = bodies_of(mesh.points, _boundary(mesh.tets[mesh.region == tag]).astype(np.int64))
+        bodies = bodies_of(mesh.points, outer_faces(mesh.tets[mesh.region == tag])[0].astype(np.int64))
         for number, body in enumerate(bodies, start=1):
             numbered = name if len(bodies) == 1 else f"{name} {number}"
             inner.append(ClosedSurface(numbered, *_closed(*body, f"{tets.source}: {numbered}")))
-    return PatientSurfaces(organ, tuple(inner), (tets.source,), tets.notes)
+    return PatientSurfaces(organ, tuple(inner), (tets.source,))
 
 
 def _closed(points: FloatArray, triangles: IntArray | Triangles, name: str) -> tuple[FloatArray, Triangles]:
@@ -159,10 +165,3 @@ def _closed(points: FloatArray, triangles: IntArray | Triangles, name: str) -> t
         return check_surface(*merge_vertices(points, triangles))
     except MeshError as error:
         raise MeshError(f"{name}: {error}; leave --remesh out to keep its tets") from None
-
-
-def _boundary(tets: IntArray) -> IntArray:
-    """Outward triangles of single tets, shape (n, 3)."""
-    faces = tets[:, TET_FACES].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[first[count == 1]]

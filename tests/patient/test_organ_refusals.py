@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from surgsim_apps.cli.main import main
-from surgsim_apps.patient.surface_files import read_organ_surface
+from surgsim_apps.patient.surface_files import ClosedSurface, read_organ_surface
 from tests.patient.scans import LABELS, scan
 from tests.patient.surfaces import ball
 
@@ -73,7 +73,11 @@ def test_solids_beside_the_organ_are_named(tmp_path, suffix):
             start += len(mesh.vertices)
     file = tmp_path / f"scan{suffix}"
     file.write_text(text)
-    surface, (note,) = read_organ_surface(file, "mm", mend=True)
-    assert surface.volume == pytest.approx(trimesh.creation.icosphere(2, 0.03).volume, rel=1e-5)
+    with pytest.warns(UserWarning, match="beside the largest") as caught:
+        surface = read_organ_surface(file, "mm", mend=True)
+    note = str(caught[0].message)
+    assert isinstance(surface, ClosedSurface) and surface.volume == pytest.approx(
+        trimesh.creation.icosphere(2, 0.03).volume, rel=1e-5
+    )
     assert "'tumour', inside" in note and "'vein', outside" in note
     assert f"{trimesh.creation.icosphere(2, 8.0).volume / 1e3:.3g} ml" in note

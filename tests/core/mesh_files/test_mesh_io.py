@@ -183,6 +183,21 @@ def test_cell_data_of_any_name(tmp_path, numbers):
     assert read_mesh(path, length_unit="mm", cell_data="part").region.tolist() == [1, 1]
 
 
+@pytest.mark.parametrize(
+    ("suffix", "arrays", "named"),
+    [
+        (".vtu", {"tissue": [7, 7]}, r"\btissue\b"),
+        (".vtu", {"tissue": [np.nan, 1.0]}, r"\btissue\b"),
+        (".msh", {"gmsh:physical": [0, 0], "gmsh:geometrical": [1, 2]}, r"gmsh:geometrical \(1, 2\)"),
+    ],
+)
+def test_cell_data_that_are_no_regions_are_named(tmp_path, suffix, arrays, named):
+    cell_data = {name: [np.array(values)] for name, values in arrays.items()}
+    path = written(tmp_path / f"a{suffix}", cell_data=cell_data, file_format="gmsh22" if suffix == ".msh" else None)
+    with pytest.warns(UserWarning, match=named):
+        assert read_mesh(path, length_unit="mm").region.tolist() == [0, 0]
+
+
 def test_point_data_are_named(tmp_path):
     path = written(tmp_path / "a.vtu", point_data={"labels": np.array([0, 1, 1, 2, 0])})
     with pytest.warns(UserWarning, match=r"labels \(0, 1, 2\)"):

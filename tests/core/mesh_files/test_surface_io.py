@@ -108,6 +108,15 @@ def test_a_text_cut_short_is_refused(tmp_path, suffix, share):
         read_surface(path, length_unit="mm")
 
 
+def test_empty_lines_after_a_text_are_no_content(tmp_path):
+    path = surface_file(tmp_path / "a.ply")
+    path.write_text(path.read_text() + "\n \n")
+    assert len(read_surface(path, length_unit="mm")[1]) == 4
+    path.write_text(path.read_text() + "1 2 3\n")
+    with pytest.raises(MeshError, match=r"\b8 .* 9 are there"):
+        read_surface(path, length_unit="mm")
+
+
 def test_a_second_solid_cut_short_is_refused(tmp_path):
     text = surface_file(tmp_path / "a.stl").read_text()
     (tmp_path / "a.stl").write_text(text + text[:-60])

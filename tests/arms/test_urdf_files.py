@@ -220,6 +220,7 @@ def test_an_incomplete_inertia_of_a_link_that_does_not_move_is_replaced(tmp_path
         ({"limits": {"j3": LIMIT.replace('"2"', '"fast"')}}, "j3: limit velocity"),
         ({"limits": {"j3": '<mimic joint="j2" multiplier="x"/>'}}, "j3: mimic multiplier"),
         ({"last": '<origin xyz="0, 0, 0.1"/>' + ROUND}, "shaft: origin xyz"),
+        ({"more": '<material name="red"><color rgba="${r} 0 0 1"/></material>'}, "red: color rgba.*xacro"),
         ({"last": '<origin xyz="0 0"/>' + ROUND}, "shaft: origin xyz"),
         ({"last": '<origin xyz="0 0 inf"/>' + ROUND}, "shaft: origin xyz"),
         ({"more": '<x:if xmlns:x="http://www.ros.org/wiki/xacro" value="1"/>'}, "xacro"),
@@ -266,13 +267,25 @@ def test_crossed_limits_are_put_in_order(plain, tmp_path, capfd):
 
 
 @pytest.mark.parametrize(
-    "limit", ['<limit lower="0" upper="0" effort="0" velocity="0"/>', '<limit lower="-inf" upper="inf"/>', "<limit/>"]
+    "limit",
+    [
+        '<limit lower="0" upper="0" effort="0" velocity="0"/>',
+        '<limit lower="-inf" upper="inf"/>',
+        "<limit/>",
+        '<limit lower="0" upper="-1"/>',
+    ],
 )
 def test_limits_of_zero_or_infinity_are_none(tmp_path, limit):
     survey = ModelSurvey(written(tmp_path, limits={"j4": limit}))
     assert not survey.locked
     assert not survey.model.joint("j4").limited[0]
     assert survey.model.njnt == 6
+
+
+@pytest.mark.parametrize(("limit", "limits"), [('upper="1.2"', (0.0, 1.2)), ('lower="-1.2"', (-1.2, 0.0))])
+def test_a_limit_that_is_not_stated_is_0(tmp_path, limit, limits):
+    survey = ModelSurvey(written(tmp_path, limits={"j4": f"<limit {limit}/>"}))
+    assert survey.range_of(survey.model.joint("j4").id, np.inf) == limits
 
 
 def test_limits_of_mjcf_joints_are_read_likewise(tmp_path):

@@ -143,12 +143,13 @@ def _check_leaders(root: ElementTree.Element) -> None:
     """Check that the joints of a URDF follow joints that move: MuJoCo leaves out other couplings."""
     moving = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") in URDF_JOINTS}
     for joint in root.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None and joint.get("name") in moving and mimic.get("joint") not in moving:
-            leader = mimic.get("joint", "")
+        mimic, name = joint.find("mimic"), joint.get("name", "")
+        leader = "" if mimic is None else mimic.get("joint", "")
+        others = moving - {name}
+        if mimic is not None and name in moving and leader not in others:
             raise ValueError(
-                f"joint {joint.get('name')!r} follows {leader!r} by <mimic>, which is no joint that moves"
-                f"{nearest(leader, sorted(moving))}: name one there, or take the <mimic> out"
+                f"joint {name!r} follows {leader!r} by <mimic>, which is no other joint that moves"
+                f"{nearest(leader, sorted(others))}: name one there, or take the <mimic> out"
             )
 
 

@@ -48,7 +48,7 @@ def check_numbers(root: ElementTree.Element, path: Path) -> None:
     """
     if any("xacro}" in element.tag for element in root.iter()):
         raise ValueError(f"model file {path} is a xacro template: expand it (xacro {path.name} > arm.urdf), name that")
-    for part in (*root.findall("link"), *root.findall("joint")):
+    for part in (*root.findall("link"), *root.findall("joint"), *root.findall("material")):
         for element in part.iter():
             for name, text in element.attrib.items():
                 where = f"model file {path}: {part.tag} {part.get('name', '')}: {element.tag} {name} is {text!r}"
@@ -247,19 +247,25 @@ def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
 
 
 def _ignored_limits(root: ElementTree.Element) -> dict[str, tuple[float, float]]:
-    """Take out limits that are equal, cross or are infinite; the first two are returned."""
+    """Take out limits that are equal, cross or state none; the first two are returned.
+
+    A missing lower or upper one is 0. Infinite ones, and PyBullet's 0 and -1, state none.
+    """
     ignored = {}
     for joint in root.findall("joint"):
         limit = joint.find("limit")
         if limit is None or joint.get("type") not in ("revolute", "prismatic"):
             continue
         lower, upper = (float(limit.get(name, 0.0)) for name in ("lower", "upper"))
-        endless = math.isinf(lower) or math.isinf(upper)
+        endless = math.isinf(lower) or math.isinf(upper) or (lower, upper) == (0.0, -1.0)
         if not endless and lower >= upper:
             ignored[joint.get("name", "")] = lower, upper
         if endless or lower >= upper:
             limit.attrib.pop("lower", None)
             limit.attrib.pop("upper", None)
+        else:
+            limit.set("lower", repr(lower))
+            limit.set("upper", repr(upper))
     return ignored
 
 

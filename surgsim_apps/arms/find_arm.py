@@ -28,7 +28,6 @@ from surgsim_apps.arms.survey import (
 )
 from surgsim_env.instruments import (
     Arm,
-    PoseSolution,
     compile_arm,
     joint_law,
     position_actuator,
@@ -179,7 +178,7 @@ class _Finder:
         self.notes.append(f"chain of {len(self.driven)} joints: {', '.join(self.names)}")
         for index, name in enumerate(self.names):
             led = self.followers.joints[self.followers.driver == index]
-            names = [self.model.joint(joint).name for joint in led]
+            names = [self.model.joint(joint).name for joint in led if joint in self.chain.moving]
             if names:
                 self.notes.append(f"coupled to {name}: {', '.join(names)}")
         self.notes.append(f"its end: {survey.body_name(body)}")
@@ -464,12 +463,9 @@ class _Finder:
         place = trocar + self.depth * into
         for direction in (into, None):
             pose = solve_pose(arm, place, direction=direction, start=start)
-            if pose.position_error < 1e-6 and self._in_trocar(arm, pose) and (direction is None or pose.reached):
+            if max(pose.position_error, pose.trocar_error) < 1e-6 and (direction is None or pose.reached):
                 return pose.joints
         return None
-
-    def _in_trocar(self, arm: Arm, pose: PoseSolution) -> bool:
-        return pose.trocar_error <= 1e-6
 
     def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
         """Poses with different joints that turn the shaft about a remote centre."""
@@ -560,7 +556,7 @@ class _Finder:
         model, followers, held = self.model, self.followers, {}
         moved = dict(zip(followers.joints.tolist(), followers.values(home), strict=True))
         moved |= dict(zip(self.driven, home, strict=True))
-        for joint in sorted(set(range(model.njnt)) - moved.keys()):
+        for joint in sorted(set(range(model.njnt)) - self.chain.moving):
             if model.jnt_type[joint] != FREE:
                 path, value = joint_law(model, joint)
                 root = moved.get(path[-1], np.clip(0.0, *self.survey.range_of(path[-1], math.inf)))
@@ -644,7 +640,7 @@ def reach_share(arm: Arm, home: FloatArray, into: FloatArray, depth: float) -> f
     ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for axis in sides for side in (axis, -axis))]
     places = [arm.trocar + (depth + further) * way for way in ways for further in DEPTHS]
     poses = [solve_pose(arm, place, start=home, iterations=60) for place in places]
-    return float(np.mean([pose.position_error < 1e-6 and pose.trocar_error <= 1e-6 for pose in poses]))
+    return float(np.mean([max(pose.position_error, pose.trocar_error) < 1e-6 for pose in poses]))
 
 
 def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:

@@ -105,12 +105,14 @@ class Chain:
         joints: from the base to the tip
         driven: those of them with a drive, n
         followers: the others, and joints beside the chain that its joints follow
+        moving: all of these but joints beside the chain that one alone follows: that is driven in their place
         limits: of the driven joints, within those of their followers; infinite without any [rad or m]   (n, 2)
     """
 
     joints: list[int]
     driven: list[int]
     followers: Followers
+    moving: set[int]
     limits: FloatArray
 
 
@@ -261,9 +263,11 @@ class ModelSurvey:
         driven = self._driven(joints)
         own = np.array([self.range_of(joint, np.inf) for joint in driven])
         with self._named():
-            moved = sorted({part for joint in joints for part in joint_law(self.model, joint).path})
-            followers = followers_of(self.model, driven, moved)
-            return Chain(joints, driven, followers, narrowed_limits(self.model, driven, followers, own))
+            paths = [joint_law(self.model, joint).path for joint in joints]
+            roots = [path[-1] for path in paths]
+            moving = {*joints, *(part for path in paths if roots.count(path[-1]) > 1 for part in path)}
+            followers = followers_of(self.model, driven, sorted({part for path in paths for part in path}))
+            return Chain(joints, driven, followers, moving, narrowed_limits(self.model, driven, followers, own))
 
     def _driven(self, joints: Sequence[int]) -> list[int]:
         """Joints to be driven: of those with one root, the root or else the first."""

@@ -71,7 +71,7 @@ def _are_numbers(text: str, count: int, tag: str) -> bool:
 
 def prepare_urdf(
     root: ElementTree.Element, path: Path, inertias: Sequence[LinkInertia], dropped_meshes: Sequence[str]
-) -> dict[str, tuple[float, float]]:
+) -> None:
     """Change a URDF's elements for MuJoCo.
 
     Args:
@@ -79,9 +79,6 @@ def prepare_urdf(
         path: of the file.
         inertias: of links, in place of the file's own.
         dropped_meshes: file names in the URDF of meshes to be left out with their shapes.
-
-    Returns:
-        Limits [rad or m] that are equal or cross, taken out: MuJoCo ignores them, with a printed warning.
 
     Raises:
         ValueError: a missing mesh file, an unknown link or mesh.
@@ -109,7 +106,6 @@ def prepare_urdf(
         compiler.attrib.pop(name, None)
     compiler.attrib.update({**COMPILER, **compiler.attrib, "fusestatic": "false", "strippath": "false"})
     _set_inertias(root, inertias)
-    return _ignored_limits(root)
 
 
 def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
@@ -138,7 +134,7 @@ def shape_fault(shape: ElementTree.Element) -> str | None:
     values = [float(value) for text in sizes for value in text.split()]
     if all(sizes) and all(0.0 < value < math.inf for value in values):
         return None
-    return f"{solid.tag} of {', '.join(f'{n} {s!r}' for n, s in zip(SIZES[solid.tag], sizes, strict=True))}"
+    return f"{solid.tag} of {', '.join(f'{name} {text!r}' for name, text in solid.attrib.items())}"
 
 
 def shape_faults(root: ElementTree.Element, path: Path) -> tuple[list[str], dict[str, list[str]]]:
@@ -244,29 +240,6 @@ def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
     for ending in endings:
         yield from (place.joinpath(*ending) for place in above)
     yield from (place / "meshes" / parts[-1] for place in above)
-
-
-def _ignored_limits(root: ElementTree.Element) -> dict[str, tuple[float, float]]:
-    """Take out limits that are equal, cross or state none; the first two are returned.
-
-    A missing lower or upper one is 0. Infinite ones, and PyBullet's 0 and -1, state none.
-    """
-    ignored = {}
-    for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
-            continue
-        lower, upper = (float(limit.get(name, 0.0)) for name in ("lower", "upper"))
-        endless = math.isinf(lower) or math.isinf(upper) or (lower, upper) == (0.0, -1.0)
-        if not endless and lower >= upper:
-            ignored[joint.get("name", "")] = lower, upper
-        if endless or lower >= upper:
-            limit.attrib.pop("lower", None)
-            limit.attrib.pop("upper", None)
-        else:
-            limit.set("lower", repr(lower))
-            limit.set("upper", repr(upper))
-    return ignored
 
 
 def _set_inertias(root: ElementTree.Element, inertias: Sequence[LinkInertia]) -> None:

@@ -161,16 +161,17 @@ class _Finder:
         most = np.where(self.model.jnt_type[self.driven] == SLIDE, SLIDE_RANGE, TURN_RANGE)
         free = np.isinf(stated).any(axis=1)
         narrowed = ~free & (stated != own).any(axis=1)
-        limits = np.where(free[:, None], np.stack([-most, most], axis=1), stated)
+        limits = np.where(np.isfinite(stated), stated, np.stack([-most, most], axis=1))
         written = free | narrowed | np.isin(self.names, list(self.survey.crossed))
-        pairs = {name: (low, high) for name, (low, high) in zip(self.names, limits.round(9).tolist(), strict=True)}
-        self.given_limits = {name: pairs[name] for name in np.array(self.names)[written].tolist()}
+        rows = zip(self.names, written, limits.round(9).tolist(), strict=True)
+        self.given_limits = {name: (low, high) for name, new, (low, high) in rows if new}
+        names = np.array(self.names)
         if narrowed.any():
-            names = ", ".join(np.array(self.names)[narrowed])
-            self.chosen.append(f"limits are narrowed to those of coupled joints: {names}")
+            self.chosen.append(f"limits are narrowed to those of coupled joints: {', '.join(names[narrowed])}")
         if free.any():
-            names = ", ".join(np.array(self.names)[free])
-            self.chosen.append(f"joints without limits ({names}) get one turn to either side, or -0.5 to 0.5 m")
+            self.chosen.append(
+                f"joints without limits ({', '.join(names[free])}) get one turn to either side, or -0.5 to 0.5 m"
+            )
         return limits
 
     def _say_model(self, body: int) -> None:

@@ -261,13 +261,12 @@ class ModelSurvey:
         if not joints:
             raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
         driven = self._driven(joints)
-        own = np.array([self.range_of(joint, np.inf) for joint in driven])
         with self._named():
             paths = [joint_law(self.model, joint).path for joint in joints]
             roots = [path[-1] for path in paths]
             moving = {*joints, *(part for path in paths if roots.count(path[-1]) > 1 for part in path)}
             followers = followers_of(self.model, driven, sorted({part for path in paths for part in path}))
-            return Chain(joints, driven, followers, moving, narrowed_limits(self.model, driven, followers, own))
+            return Chain(joints, driven, followers, moving, narrowed_limits(self.model, driven, followers))
 
     def _driven(self, joints: Sequence[int]) -> list[int]:
         """Joints to be driven: of those with one root, the root or else the first."""

@@ -122,15 +122,14 @@ def followers_of(model: mujoco.MjModel, driven: Sequence[int], joints: Iterable[
     return Followers(*table[:, :2].T.astype(np.int64), *table[:, 2:].T)
 
 
-def narrowed_limits(
-    model: mujoco.MjModel, driven: Sequence[int], followers: Followers, limits: FloatArray
-) -> FloatArray:
-    """Limits of driven joints [rad or m] within which their followers keep their own, both (n, 2).
+def narrowed_limits(model: mujoco.MjModel, driven: Sequence[int], followers: Followers) -> FloatArray:
+    """Limits of driven joints [rad or m] (n, 2) within which their followers keep their own; infinite without any.
 
     Raises:
         ValueError: a joint that its followers leave no range.
     """
-    narrow = limits.copy()
+    limited = model.jnt_limited[driven].astype(bool)
+    narrow = np.where(limited[:, None], model.jnt_range[driven], [-np.inf, np.inf])
     for joint, driver, slope, offset in zip(*followers, strict=True):
         if model.jnt_limited[joint]:
             low, high = sorted((model.jnt_range[joint] - offset) / slope)

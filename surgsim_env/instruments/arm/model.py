@@ -344,9 +344,7 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
 def _narrow_limits(model: mujoco.MjModel, arm: ArmDescription) -> None:
     """Narrow the limits of driven joints to those of the joints that follow them."""
     driven = [model.joint(name).id for name in arm.joints]
-    limited = model.jnt_limited[driven].astype(bool)[:, None]
-    own = np.where(limited, model.jnt_range[driven], [-np.inf, np.inf])
-    narrow = narrowed_limits(model, driven, followers_in(model, arm), own)
+    narrow = narrowed_limits(model, driven, followers_in(model, arm))
     for joint, limits in zip(driven, narrow, strict=True):
         if np.isfinite(limits).all():
             model.jnt_limited[joint], model.jnt_range[joint] = 1, limits

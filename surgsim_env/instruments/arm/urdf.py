@@ -209,11 +209,11 @@ def mesh_files(root: ElementTree.Element, path: Path) -> dict[str, Path | None]:
     folder = stated.get("meshdir", stated.get("assetdir", ""))
     strip = stated.get("strippath") != "false"
     names = dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh"))
-    return {name: find_mesh(path, name, folder, strip) for name in names}
+    return {name: next(filter(Path.is_file, _places(path, name, folder, strip)), None) for name in names}
 
 
-def find_mesh(path: Path, name: str, folder: str = "", strip: bool = True) -> Path | None:
-    """Path of a mesh by its name in a URDF, or None.
+def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
+    """Candidate paths of a mesh: in its stated folder, as named, by less and less of its path below folders above.
 
     Args:
         path: of the URDF.
@@ -221,11 +221,6 @@ def find_mesh(path: Path, name: str, folder: str = "", strip: bool = True) -> Pa
         folder: of the meshes by the URDF's compiler element.
         strip: True if that element takes folders off their names, as by default.
     """
-    return next((place for place in _places(path, name, folder, strip) if place.is_file()), None)
-
-
-def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
-    """Candidate paths of a mesh: in its stated folder, as named, by less and less of its path below folders above."""
     scheme, separator, rest = name.rpartition("://")
     parts = PurePosixPath((rest if separator else name).replace("\\", "/")).parts
     if not parts:

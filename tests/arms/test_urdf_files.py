@@ -243,7 +243,7 @@ FOLLOWER = (
 )
 
 
-def test_a_joint_with_equal_limits_is_held_there_with_what_follows_it(tmp_path, capfd):
+def test_a_joint_with_equal_limits_is_held_there_with_what_follows_it(tmp_path, capfd, recwarn):
     path = written(tmp_path, limits={"j4": LOCKED}, more=FOLLOWER)
     description = find_arm(path).description
     assert description.joints == ("j1", "j2", "j3", "j5", "j6")
@@ -252,6 +252,7 @@ def test_a_joint_with_equal_limits_is_held_there_with_what_follows_it(tmp_path, 
     # With the driven joints at 0 the shaft's z axis is turned by 0.3 about x.
     axis = ModelSurvey(path).data.body("shaft").xmat.reshape(3, 3)[:, 2]
     np.testing.assert_allclose(axis, [0.0, -np.sin(0.3), np.cos(0.3)], atol=1e-12)
+    assert not recwarn.list
     assert capfd.readouterr().err == ""
 
 

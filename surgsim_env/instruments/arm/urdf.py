@@ -56,17 +56,17 @@ def check_numbers(root: ElementTree.Element, path: Path) -> None:
                     raise ValueError(f"{where}: run xacro first")
                 count = NUMBERS.get(name) if name != "value" or element.tag == "mass" else None
                 if count and not _are_numbers(text, count, element.tag):
-                    raise ValueError(f"{where}; write {count} number{'s with blanks between them' * (count > 1)}")
+                    raise ValueError(f"{where}; numbers to be written there, with blanks between them: {count}")
 
 
 def _are_numbers(text: str, count: int, tag: str) -> bool:
     """True for as many numbers; those of limits may be infinite."""
     try:
-        values = [float(value) for value in text.split()]
+        values = np.array(text.split(), dtype=np.float64)
     except ValueError:
         return False
-    bad = math.isnan if tag == "limit" else lambda value: not math.isfinite(value)
-    return len(values) == count and (tag in REPLACED or not any(map(bad, values)))
+    finite = ~np.isnan(values) if tag == "limit" else np.isfinite(values)
+    return len(values) == count and (tag in REPLACED or bool(finite.all()))
 
 
 def prepare_urdf(

@@ -28,11 +28,8 @@ from surgsim_apps.arms.survey import (
 )
 from surgsim_env.instruments import (
     Arm,
-    PoseSolution,
     compile_arm,
-    coupled_value,
-    couplings_to_root,
-    joint_value,
+    joint_law,
     position_actuator,
     solve_pose,
 )
@@ -130,18 +127,15 @@ class _Finder:
         self.survey, self.model = survey, survey.model
         self.notes, self.chosen = [], []
         body, offset = survey.find_tip(tip)
-        self.chain = survey.chain(body)
+        self.chain, self.centre = survey.chain(body), None
+        if tool_length is None:
+            self.chain, self.centre = survey.centred_chain(body, np.zeros(3) if offset is None else offset)
         self.moved, self.driven, self.followers = self.chain.joints, self.chain.driven, self.chain.followers
         self.names = [self.model.joint(joint).name for joint in self.driven]
-        limits = self._limits()
-        self.lower, self.upper = np.array(limits).T
+        self.lower, self.upper = self._limits().T
         self.zero = np.clip(0.0, self.lower, self.upper)
         self._say_model(body)
-        centre = None
-        if tool_length is None:
-            centre = survey.remote_centre(self.chain, body, np.zeros(3) if offset is None else offset)
-        self.centre = centre
-        self.depth = HOME_DEPTH
+        centre, self.depth = self.centre, HOME_DEPTH
         if centre is not None:
             least, most = centre.depths
             margin = min(HOME_MARGIN, 0.5 * (most - least))
@@ -161,33 +155,31 @@ class _Finder:
 
     # ---- findings in the file --------------------------------------------------------------------------------
 
-    def _limits(self) -> list[tuple[float, float]]:
-        stated = self.chain.limits
-        slides = self.model.jnt_type[self.driven] == SLIDE
-        most = np.where(slides, SLIDE_RANGE, TURN_RANGE)
+    def _limits(self) -> FloatArray:
+        """Limits of the driven joints (n, 2) [rad or m]."""
+        stated, own = self.chain.limits, np.array([self.survey.range_of(joint, math.inf) for joint in self.driven])
+        most = np.where(self.model.jnt_type[self.driven] == SLIDE, SLIDE_RANGE, TURN_RANGE)
+        free = np.isinf(stated).any(axis=1)
+        narrowed = ~free & (stated != own).any(axis=1)
         limits = np.where(np.isfinite(stated), stated, np.stack([-most, most], axis=1))
-        pairs = zip(self.names, limits.round(9).tolist(), strict=True)
-        own = np.array([self.survey.range_of(joint, math.inf) for joint in self.driven])
-        crossed = np.isin(self.names, list(self.survey.crossed))
-        changed = (limits != own).any(axis=1)
-        written = zip(changed | crossed, pairs, strict=True)
-        self.given_limits = {name: (low, high) for new, (name, (low, high)) in written if new}
-        free = [name for name, pair in zip(self.names, stated, strict=True) if not np.isfinite(pair).all()]
-        narrowed = [name for new, name in zip(changed, self.names, strict=True) if new and name not in free]
-        if narrowed:
-            self.chosen.append(f"limits are narrowed to those of coupled joints: {', '.join(narrowed)}")
-        if free:
+        written = free | narrowed | np.isin(self.names, list(self.survey.crossed))
+        rows = zip(self.names, written, limits.round(9).tolist(), strict=True)
+        self.given_limits = {name: (low, high) for name, new, (low, high) in rows if new}
+        names = np.array(self.names)
+        if narrowed.any():
+            self.chosen.append(f"limits are narrowed to those of coupled joints: {', '.join(names[narrowed])}")
+        if free.any():
             self.chosen.append(
-                f"joints without limits ({', '.join(free)}) get one turn to either side, or -0.5 to 0.5 m"
+                f"joints without limits ({', '.join(names[free])}) get one turn to either side, or -0.5 to 0.5 m"
             )
-        return [(low, high) for low, high in limits.tolist()]
+        return limits
 
     def _say_model(self, body: int) -> None:
         survey = self.survey
         self.notes.append(f"chain of {len(self.driven)} joints: {', '.join(self.names)}")
         for index, name in enumerate(self.names):
-            led = self.followers.joints[(self.followers.driver == index) & (self.followers.slope != 0.0)]
-            names = [self.model.joint(joint).name for joint in led if joint in self.moved]
+            led = self.followers.joints[self.followers.driver == index]
+            names = [self.model.joint(joint).name for joint in led if joint in self.chain.moving]
             if names:
                 self.notes.append(f"coupled to {name}: {', '.join(names)}")
         self.notes.append(f"its end: {survey.body_name(body)}")
@@ -198,7 +190,7 @@ class _Finder:
             self.chosen.append(f"limits whose lower is above the upper one are used in order: {_listed(pairs)}")
         if survey.locked:
             values = [f"{name} at {value:g}" for name, value in survey.locked.items()]
-            self.chosen.append(f"joints with equal limits, and those coupled to them, are held: {_listed(values)}")
+            self.chosen.append(f"joints that cannot move by their limits or couplings are held: {_listed(values)}")
         if survey.inertias:
             self.chosen.append(
                 "links without a valid inertia get that of a block around their shapes: "
@@ -472,12 +464,9 @@ class _Finder:
         place = trocar + self.depth * into
         for direction in (into, None):
             pose = solve_pose(arm, place, direction=direction, start=start)
-            if pose.position_error < 1e-6 and self._in_trocar(arm, pose) and (direction is None or pose.reached):
+            if max(pose.position_error, pose.trocar_error) < 1e-6 and (direction is None or pose.reached):
                 return pose.joints
         return None
-
-    def _in_trocar(self, arm: Arm, pose: PoseSolution) -> bool:
-        return pose.trocar_error <= 1e-6
 
     def _starts_about(self, centre: RemoteCentre) -> list[FloatArray]:
         """Poses with different joints that turn the shaft about a remote centre."""
@@ -527,9 +516,7 @@ class _Finder:
         default = np.where(slides, SLIDE_SPEED, TURN_SPEED)
         speed = np.array([stated.get(name, value) for name, value in zip(self.names, default, strict=True)])
         for joint, driver, slope, _ in zip(*self.followers, strict=True):
-            if slope != 0.0:
-                most = stated.get(self.model.joint(joint).name, math.inf) / abs(slope)
-                speed[driver] = min(speed[driver], most)
+            speed[driver] = min(speed[driver], stated.get(self.model.joint(joint).name, math.inf) / abs(slope))
         return tuple(speed.tolist())
 
     def _control(self, arm: Arm, home: FloatArray) -> JointControl:
@@ -566,21 +553,15 @@ class _Finder:
         return bool(least <= self.lower[index] + 1e-9 and most >= self.upper[index] - 1e-9)
 
     def _held(self, home: FloatArray) -> dict[str, float]:
-        """Values of undriven joints: as coupled to driven ones at home, or to a root at 0 or the nearest limit."""
-        model, survey, values = self.model, self.survey, {}
-        for joint, value in zip(self.driven, home, strict=True):
-            root, slope, offset = joint_value(model, joint)
-            values[root] = float(value - offset) / slope
-        # Joints that two of the chain follow move with it.
-        roots = [joint_value(model, joint).root for joint in self.moved]
-        shared = [joint for joint, root in zip(self.moved, roots, strict=True) if roots.count(root) > 1]
-        held = {}
-        for joint in sorted(set(range(model.njnt)).difference(self.moved, survey.leaders(shared))):
+        """Values of joints that do not move: as coupled to those that do at home, or to a root at 0 or its limit."""
+        model, followers, held = self.model, self.followers, {}
+        moved = dict(zip(followers.joints.tolist(), followers.values(home), strict=True))
+        moved |= dict(zip(self.driven, home, strict=True))
+        for joint in sorted(set(range(model.njnt)) - self.chain.moving):
             if model.jnt_type[joint] != FREE:
-                couplings = couplings_to_root(model, joint)
-                root = couplings[-1].leader if couplings else joint
-                value = values.get(root, float(np.clip(0.0, *survey.range_of(root, math.inf))))
-                held[model.joint(joint).name] = round(coupled_value(model, couplings, value), 9) + 0.0
+                path, value = joint_law(model, joint)
+                root = moved.get(path[-1], np.clip(0.0, *self.survey.range_of(path[-1], math.inf)))
+                held[model.joint(joint).name] = round(float(value(root)), 9) + 0.0
         return held
 
     def _description(
@@ -643,7 +624,7 @@ class _Finder:
         description = self._description(link_shapes, control, clipped, point, into)
         held = [name for name in description.held if name not in self.survey.locked]
         if held:
-            self.chosen.append(f"joints that do not move the tip are held: {_listed(held)}")
+            self.chosen.append(f"other joints are held: {_listed(held)}")
         if self.centre is None and self.trocar_given is None:
             self.chosen.append(f"trocar at {vector(point, 4)} m of the model's frame; --trocar x,y,z sets another one")
         self.notes.append(
@@ -660,7 +641,7 @@ def reach_share(arm: Arm, home: FloatArray, into: FloatArray, depth: float) -> f
     ways = [into, *(float(cos(TILT)) * into + float(sin(TILT)) * side for axis in sides for side in (axis, -axis))]
     places = [arm.trocar + (depth + further) * way for way in ways for further in DEPTHS]
     poses = [solve_pose(arm, place, start=home, iterations=60) for place in places]
-    return float(np.mean([pose.position_error < 1e-6 and pose.trocar_error <= 1e-6 for pose in poses]))
+    return float(np.mean([max(pose.position_error, pose.trocar_error) < 1e-6 for pose in poses]))
 
 
 def joint_inertia(arm: Arm, joints: Sequence[float] | FloatArray) -> FloatArray:

@@ -10,16 +10,15 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from msdm_core.arithmetic import cbrt, cos, dot, eigh, lstsq, matmul, norm, power, sin, solve, svd
+from msdm_core.arithmetic import cbrt, cos, dot, eigh, lstsq, matmul, norm, sin, solve, svd
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.urdf_links import faulty_links, speed_limits
 from surgsim_env.instruments import (
     Followers,
-    coupled_value,
-    couplings_to_root,
     followers_of,
     hold_joints,
-    joint_value,
+    joint_law,
+    linear_law,
     narrowed_limits,
     read_model,
     read_xml,
@@ -41,8 +40,10 @@ LENGTH_MOST, MESH_LEAST = 5.0, 0.001
 # Largest distance of axes from their meeting point [m].
 MEETING_TOLERANCE = 1e-4
 # A shaft has a remote centre if it passes a point by no more in so many poses [m]: chosen, for the parallelogram of
-# jhu-dvrk/dvrk_model's da Vinci Si, which leaves it by 4 mm.
-CENTRE_TOLERANCE, POSES = 5e-3, 256
+# jhu-dvrk/dvrk_model's da Vinci Si, which leaves it by 4.7 mm.
+CENTRE_TOLERANCE, POSES = 5e-3, 1000
+# Joints before a remote centre set it up and are held if so many driven ones remain: chosen, a tip's freedoms.
+DRIVEN_LEAST = 6
 # Words in the names of frames at a tool's tip.
 TIP_WORDS = ("tip", "tcp", "tool0", "end_effector", "ee_link", "attachment", "flange")
 # As numbers: a numpy integer equals no member of MuJoCo's enumerations.
@@ -104,12 +105,14 @@ class Chain:
         joints: from the base to the tip
         driven: those of them with a drive, n
         followers: the others, and joints beside the chain that its joints follow
+        moving: all of these but joints beside the chain that one alone follows: that is driven in their place
         limits: of the driven joints, within those of their followers; infinite without any [rad or m]   (n, 2)
     """
 
     joints: list[int]
     driven: list[int]
     followers: Followers
+    moving: set[int]
     limits: FloatArray
 
 
@@ -122,7 +125,7 @@ class ModelSurvey:
         dropped_meshes: of a URDF, missing or unreadable
         left_out: links and meshes of a URDF's shapes that are left out, by reason
         speed_limits: of a URDF [rad/s or m/s]
-        locked: values of joints with equal limits, and of those coupled to them [rad or m]; taken out of the model
+        locked: values of joints that cannot move by their limits or couplings [rad or m]; taken out of the model
         crossed: limits of joints in whose file the lower is above the upper one, in order [rad or m]
         angle_unit: of the file's hinges [rad]
         model, data: of MuJoCo, at the model's initial joint values
@@ -160,14 +163,11 @@ class ModelSurvey:
         self._check_sizes()
 
     def _compile(self, inertias: Sequence[LinkInertia]) -> None:
-        try:
-            with warned(f"arm {self.path.stem!r}"):
-                spec = read_model(self.path, inertias, self.dropped_meshes)
-                self.angle_unit = math.radians(1.0) if spec.compiler.degree else 1.0
-                hold_joints(spec, self.locked)
-                self.model = spec.compile()
-        except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
-            raise ValueError(f"model file {self.path}: {' '.join(str(error).split())}") from None
+        with self._named(), warned(f"arm {self.path.stem!r}"):
+            spec = read_model(self.path, inertias, self.dropped_meshes)
+            self.angle_unit = math.radians(1.0) if spec.compiler.degree else 1.0
+            hold_joints(spec, self.locked)
+            self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, self.data)
 
@@ -182,14 +182,24 @@ class ModelSurvey:
         return {self.model.joint(joint).name: (high, low) for joint, low, high in self._ignored_limits() if low > high}
 
     def _locked(self) -> dict[str, float]:
-        """Joints with equal limits, of which 0 and 0 state none, and those that follow them."""
-        model = self.model
-        values = {joint: low for joint, low, high in self._ignored_limits() if low == high != 0.0}
-        for joint in range(model.njnt if values else 0):
-            couplings = couplings_to_root(model, joint)
-            if couplings and couplings[-1].leader in values:
-                values.setdefault(joint, coupled_value(model, couplings, values[couplings[-1].leader]))
-        return {model.joint(joint).name: value for joint, value in values.items()}
+        """Joints with equal limits (0 and 0 state none), those coupled to them, and constant ones."""
+        model, values = self.model, {}
+        with self._named():
+            laws = [joint_law(model, joint) for joint in range(model.njnt)]
+            for joint, low, high in self._ignored_limits():
+                if low == high != 0.0 and laws[joint].value.degree():
+                    root, slope, offset = linear_law(model, joint)
+                    value = (low - offset) / slope
+                    if abs(values.setdefault(root, value) - value) > 1e-9:
+                        raise ValueError(
+                            f"joint {model.joint(joint).name!r} has the equal limits {low:g}, against those of a joint "
+                            "coupled to it: change either, or the coupling"
+                        )
+        return {
+            model.joint(joint).name: round(float(value(values.get(path[-1], 0.0))), 9) + 0.0
+            for joint, (path, value) in enumerate(laws)
+            if path[-1] in values or not value.degree()
+        }
 
     def _check_sizes(self) -> None:
         model = self.model
@@ -241,42 +251,38 @@ class ModelSurvey:
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return list(range(first, first + count))
 
-    def chain(self, body: int) -> Chain:
-        """Joints from the base to a body.
+    def chain(self, body: int, first: int = 0) -> Chain:
+        """Joints from the base to a body, from that of an index on.
 
         Raises:
             ValueError: there is none, or a coupling that an arm may not have.
         """
-        joints = self._joints_to(body)
+        joints = self._joints_to(body)[first:]
         if not joints:
             raise ValueError(f"model file {self.path}: no joint moves {self.body_name(body)!r}: name another --tip")
         driven = self._driven(joints)
-        own = np.array([self.range_of(joint, np.inf) for joint in driven])
         with self._named():
-            followers = followers_of(self.model, driven, [*joints, *sorted(self.leaders(joints))])
-            return Chain(joints, driven, followers, narrowed_limits(self.model, driven, followers, own))
-
-    def leaders(self, joints: Sequence[int]) -> set[int]:
-        """Joints beside a chain that its joints follow."""
-        couplings = [coupling for joint in joints for coupling in couplings_to_root(self.model, joint)]
-        return {coupling.leader for coupling in couplings}.difference(joints, [-1])
+            paths = [joint_law(self.model, joint).path for joint in joints]
+            roots = [path[-1] for path in paths]
+            moving = {*joints, *(part for path in paths if roots.count(path[-1]) > 1 for part in path)}
+            followers = followers_of(self.model, driven, sorted({part for path in paths for part in path}))
+            return Chain(joints, driven, followers, moving, narrowed_limits(self.model, driven, followers))
 
     def _driven(self, joints: Sequence[int]) -> list[int]:
         """Joints to be driven: of those with one root, the root or else the first."""
         driven: dict[int, int] = {}
-        with self._named():
-            for joint in joints:
-                root, slope, _ = joint_value(self.model, joint)
-                if slope != 0.0 and (joint == root or root not in driven):
-                    driven[root] = joint
+        for joint in joints:
+            root = joint_law(self.model, joint).path[-1]
+            if joint == root or root not in driven:
+                driven[root] = joint
         return sorted(driven.values(), key=joints.index)
 
     @contextmanager
     def _named(self) -> Iterator[None]:
         try:
             yield
-        except ValueError as error:
-            raise ValueError(f"model file {self.path}: {error}") from None
+        except (TypeError, RuntimeError, ValueError, mujoco.FatalError) as error:
+            raise ValueError(f"model file {self.path}: {' '.join(str(error).split())}") from None
 
     def find_tip(self, named: str | None) -> tuple[int, FloatArray | None]:
         """The body of the tip, and the tip's offset in that body [m] (3,) if a frame marks it.
@@ -301,7 +307,7 @@ class ModelSurvey:
         counts = [(len(self._driven(path)), len(path)) for path in paths]
         deepest = [body for body in range(model.nbody) if counts[body] == max(counts)]
         if max(counts) == (0, 0):
-            raise ValueError(f"model file {self.path} has no joint: name the model of an arm")
+            raise ValueError(f"model file {self.path} has no joint that moves: name the model of an arm")
         ends = {self._joints_to(body)[-1] for body in deepest}
         last = int(model.jnt_bodyid[min(ends)])
         if len(ends) > 1:
@@ -400,6 +406,18 @@ class ModelSurvey:
 
     # ---- remote centre ---------------------------------------------------------------------------------------
 
+    def centred_chain(self, tip: int, offset: FloatArray) -> tuple[Chain, RemoteCentre | None]:
+        """The chain of a tip and its remote centre; without the joints before that if six driven ones remain."""
+        whole = self.chain(tip)
+        for first in range(len(whole.joints)):
+            chain = self.chain(tip, first)
+            if first and len(chain.driven) < DRIVEN_LEAST:
+                break
+            centre = self.remote_centre(chain, tip, offset)
+            if centre is not None:
+                return chain, centre
+        return whole, None
+
     def remote_centre(self, chain: Chain, tip: int, offset: FloatArray) -> RemoteCentre | None:
         """The point that the line of a shaft's slide passes in all poses, within CENTRE_TOLERANCE.
 
@@ -412,19 +430,17 @@ class ModelSurvey:
         if not slides:
             return None
         driven, limits, slide = chain.driven, chain.limits, chain.joints[slides[0]]
-        roots = [joint_value(model, joint).root for joint in driven]
-        moving = [joint_value(model, joint) for joint in chain.joints[: slides[0] + 1]]
-        *turning, inserting = (roots.index(value.root) if value.slope != 0.0 else -1 for value in moving)
-        if inserting < 0 or not np.isfinite(limits[inserting]).all():
+        drivers = dict(zip(chain.followers.joints.tolist(), chain.followers.driver.tolist(), strict=True))
+        drivers |= {joint: index for index, joint in enumerate(driven)}
+        *turning, inserting = (drivers[joint] for joint in chain.joints[: slides[0] + 1])
+        if not np.isfinite(limits[inserting]).all():
             return None
         lower, upper = np.where(np.isfinite(limits), limits, [-np.pi, np.pi]).T
         self.place(chain, 0.5 * (lower + upper))
         body = self._shaft_body(chain.joints, slides[0])
         rows, right = [], []
-        # Poses spread more evenly than random ones (Niederreiter 1978).
-        advance = power(2.0, np.arange(1, len(driven) + 1) / (len(driven) + 1))
-        for share in (0.5 + np.outer(np.arange(POSES), advance)) % 1.0:
-            self.place(chain, lower + share * (upper - lower))
+        for values in np.random.default_rng(0).uniform(lower, upper, (POSES, len(driven))):
+            self.place(chain, values)
             axis = self.data.xaxis[slide]
             across = np.eye(3) - axis[:, None] * axis
             rows.append(np.hstack([across, -matmul(across, self.data.xmat[body].reshape(3, 3))]))
@@ -447,7 +463,7 @@ class ModelSurvey:
             reach.append(float(matmul(tip_now - point, along)))
         sign = float(np.sign(max(reach, key=abs)))
         least, most = sorted(sign * value for value in reach)
-        turning = frozenset(turning) - {inserting, -1}
+        turning = frozenset(turning) - {inserting}
         shaft_point = on_line - matmul(on_line, axis) * axis
         return RemoteCentre(point, body, shaft_point, sign * axis, slide, turning, (least, most), missed)
 

@@ -56,7 +56,7 @@ COMMENTS = {
     "control.armature": "[kg m^2, kg] rotor inertia, of the model or chosen for that stiffness",
     "home": "[rad, m] the shaft in the trocar, the tip past it",
     "limits": "[rad, m] of joints for which the model states none, or which joints that follow them narrow",
-    "held": "[rad, m] joints that do not move the tip, fixed at these values",
+    "held": "[rad, m] other joints, fixed at these values",
     "shapes": "sphere or capsule that the model lacks",
     "shapes.body": "link that carries it",
     "shapes.start": "[m] one end of the axis, or the middle of a ball, in the link's frame",
@@ -118,6 +118,8 @@ class Arm:
                 trocar=vector_of("--trocar", self.trocar, are_lengths=True),
                 tool_length=self.tool,
             )
+        if scheme == "robot_descriptions":
+            arm_model.chosen.append(f"the model stays in the cache of robot_descriptions: {file}")
         for sentence in arm_model.notes:
             console.print(f"found: {sentence}", highlight=False, soft_wrap=True)
         for sentence in arm_model.chosen:
@@ -143,7 +145,8 @@ class Arm:
             )
             return 1
         console.print(
-            f'try it: gymnasium.make("SurgSim/Palpate-v0", scene="phantom", instrument="{folder / names[0]}")',
+            "try it (refused where the tip does not reach the scene's face from its port): "
+            f'gymnasium.make("SurgSim/Palpate-v0", scene="phantom", instrument="{folder / names[0]}")',
             highlight=False,
             soft_wrap=True,
         )

@@ -10,10 +10,9 @@ from surgsim_env.instruments.arm.urdf import MOMENTS, shape_faults
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.instruments.joint_couplings import (
     Followers,
-    coupled_value,
-    couplings_to_root,
     followers_of,
-    joint_value,
+    joint_law,
+    linear_law,
     narrowed_limits,
 )
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
@@ -32,11 +31,10 @@ __all__ = [
     "ToolBodies",
     "check_port_outside",
     "compile_arm",
-    "coupled_value",
-    "couplings_to_root",
     "followers_of",
     "hold_joints",
-    "joint_value",
+    "joint_law",
+    "linear_law",
     "load_arm",
     "narrowed_limits",
     "parked_place",

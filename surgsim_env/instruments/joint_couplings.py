@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -22,12 +23,16 @@ class JointCoupling(NamedTuple):
     terms: FloatArray
 
 
-class JointValue(NamedTuple):
-    """A joint's value by that of its root, offset + slope * root [rad or m]."""
+class JointLaw(NamedTuple):
+    """A joint's value by that of its root.
 
-    root: int
-    slope: float
-    offset: float
+    Fields:
+        path: from the joint to its root, each the leader of that before; -1 for a constant
+        value: polynomial of the root's value [rad or m]
+    """
+
+    path: list[int]
+    value: Polynomial
 
 
 class Followers(NamedTuple):
@@ -56,88 +61,77 @@ def joint_couplings(model: mujoco.MjModel) -> list[JointCoupling]:
     return [JointCoupling(int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5]) for e in active]
 
 
-def couplings_to_root(model: mujoco.MjModel, joint: int) -> list[JointCoupling]:
-    """Couplings from a joint to its leader, from there to the next, and so on.
+def joint_law(model: mujoco.MjModel, joint: int) -> JointLaw:
+    """A joint's value by that of its root, which is the joint itself without a coupling.
 
     Raises:
         ValueError: a joint that follows two joints, or itself.
     """
-    couplings: list[JointCoupling] = []
-    while own := [coupling for coupling in joint_couplings(model) if coupling.follower == joint]:
-        if len(own) > 1 or joint in [coupling.follower for coupling in couplings]:
+    initial, path, value = model.qpos0[model.jnt_qposadr], [joint], Polynomial([0.0, 1.0])
+    while own := [coupling for coupling in joint_couplings(model) if coupling.follower == path[-1]]:
+        follower, leader, terms = own[0]
+        if len(own) > 1 or leader in path:
             raise ValueError(
-                f"joint {model.joint(joint).name!r} follows {'two joints' if len(own) > 1 else 'itself in a circle'}: "
-                "leave it one coupling, to a joint that does not follow it"
+                f"joint {model.joint(follower).name!r} follows {'two joints' if len(own) > 1 else 'itself in a circle'}"
+                ": leave it one coupling, to a joint that does not follow it"
             )
-        couplings.extend(own)
-        joint = own[0].leader
-    return couplings
+        led = Polynomial([-initial[leader], 1.0] if leader >= 0 else [0.0])
+        value = value(initial[follower] + Polynomial(terms).trim()(led))
+        path.append(leader)
+    return JointLaw(path, value.trim())
 
 
-def joint_value(model: mujoco.MjModel, joint: int) -> JointValue:
-    """A joint's value by that of its root, which is the joint itself without a coupling.
+def linear_law(model: mujoco.MjModel, joint: int) -> tuple[int, float, float]:
+    """Root, slope and offset of a joint that follows its root by these alone.
 
     Raises:
-        ValueError: a polynomial coupling, or those of `couplings_to_root`.
+        ValueError: a polynomial or constant coupling, or those of `joint_law`.
     """
-    couplings = couplings_to_root(model, joint)
-    for follower, leader, terms in couplings:
-        if terms[2:].any():
-            raise ValueError(
-                f"joint {model.joint(follower).name!r} follows {model.joint(leader).name!r} by the polynomial "
-                f"{terms.tolist()}; in an arm it follows by the first two numbers: set the others to 0 in the model"
-            )
-    offset = coupled_value(model, couplings, 0.0)
-    slope = coupled_value(model, couplings, 1.0) - offset
-    return JointValue(couplings[-1].leader if couplings else joint, slope, offset)
-
-
-def coupled_value(model: mujoco.MjModel, couplings: Sequence[JointCoupling], value: float) -> float:
-    """Value of a joint by its couplings to the root, at a value of that [rad or m]."""
-    initial = model.qpos0[model.jnt_qposadr]
-    for follower, leader, terms in reversed(couplings):
-        led = value - initial[leader] if leader >= 0 else 0.0
-        value = float(initial[follower] + np.polynomial.polynomial.polyval(led, terms))
-    return value
+    path, value = joint_law(model, joint)
+    if value.degree() != 1:
+        raise ValueError(
+            f"joint {model.joint(joint).name!r} follows by the polynomial {value.coef.tolist()}; in an arm it follows "
+            "by two numbers, the second not 0: change the coupling in the model, or hold the joint"
+        )
+    offset, slope = value.coef.tolist()
+    return path[-1], slope, offset
 
 
 def followers_of(model: mujoco.MjModel, driven: Sequence[int], joints: Iterable[int]) -> Followers:
-    """The followers of driven joints among some joints, constant ones included.
+    """The followers of driven joints among some joints.
 
     Raises:
-        ValueError: a driven joint that follows another one or is constant, or a coupling that is refused.
+        ValueError: a driven joint that follows another one, or a coupling that is refused.
     """
-    roots: dict[int, tuple[int, JointValue]] = {}
+    drivers: dict[int, tuple[int, float, float]] = {}
     for index, joint in enumerate(driven):
-        value = joint_value(model, joint)
-        if value.slope == 0.0 or value.root in roots:
+        root, slope, offset = linear_law(model, joint)
+        if root in drivers:
             raise ValueError(
                 f"joint {model.joint(joint).name!r} follows another one in the model and cannot be driven as well: "
                 "take it out of joints, home and control"
             )
-        roots[value.root] = index, value
-    found = []
+        drivers[root] = index, slope, offset
+    rows = []
     for joint in joints:
-        value = joint_value(model, joint)
-        if joint not in driven and (value.root in roots or value.slope == 0.0):
-            driver, own = roots.get(value.root, (0, value))
-            slope = value.slope / own.slope if value.slope else 0.0
-            found.append((joint, driver, slope, value.offset - slope * own.offset))
-    table = np.array(found).reshape(-1, 4)
+        root, slope, offset = linear_law(model, joint)
+        if joint not in driven and root in drivers:
+            driver, own_slope, own_offset = drivers[root]
+            rows.append((joint, driver, slope / own_slope, offset - slope / own_slope * own_offset))
+    table = np.array(rows).reshape(-1, 4)
     return Followers(*table[:, :2].T.astype(np.int64), *table[:, 2:].T)
 
 
-def narrowed_limits(
-    model: mujoco.MjModel, driven: Sequence[int], followers: Followers, limits: FloatArray
-) -> FloatArray:
-    """Limits of driven joints [rad or m] within which their followers keep their own, both (n, 2).
+def narrowed_limits(model: mujoco.MjModel, driven: Sequence[int], followers: Followers) -> FloatArray:
+    """Limits of driven joints [rad or m] (n, 2) within which their followers keep their own; infinite without any.
 
     Raises:
         ValueError: a joint that its followers leave no range.
     """
-    narrow = limits.copy()
+    limited = model.jnt_limited[driven].astype(bool)
+    narrow = np.where(limited[:, None], model.jnt_range[driven], [-np.inf, np.inf])
     for joint, driver, slope, offset in zip(*followers, strict=True):
-        if model.jnt_limited[joint] and slope != 0.0:
+        if model.jnt_limited[joint]:
             low, high = sorted((model.jnt_range[joint] - offset) / slope)
             narrow[driver] = max(narrow[driver, 0], low), min(narrow[driver, 1], high)
             if narrow[driver, 0] > narrow[driver, 1]:

@@ -237,10 +237,35 @@ def test_a_mechanism_that_nearly_keeps_its_shaft_states_by_how_much(tmp_path, mu
 def test_limits_of_followers_are_their_leaders(tmp_path, options, limits):
     description = made(tmp_path, parallelogram(**options)).description
     for arm in (load_arm(description), load_arm(replace(description, limits={}))):
-        if "more" in options and arm.description.limits == {}:
-            continue  # the leader beside is held, and its limits are gone with it
         place = arm.joints.index("pitch")
         assert (arm.lower[place], arm.upper[place]) == pytest.approx(limits, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "held"),
+    [
+        ({"limits_3": (0.1, 0.1)}, {"pitch": 0.1, "pitch_2": -0.1, "pitch_3": 0.1}),
+        ({"limits_3": (0.1, 0.1), "mimic_3": MIMIC("pitch", 2, 0.3)}, {"pitch": -0.1, "pitch_2": 0.1, "pitch_3": 0.1}),
+        ({"mimic_2": MIMIC("pitch", 0, 0.2), "mimic_3": MIMIC("pitch", 0, -0.2)}, {"pitch_2": 0.2, "pitch_3": -0.2}),
+    ],
+)
+def test_a_follower_that_cannot_move_is_held_with_its_leader(tmp_path, options, held):
+    description = made(tmp_path, parallelogram(**options)).description
+    assert description.held == pytest.approx(held, abs=1e-9)
+    assert description.joints == ("yaw", *["pitch"] * ("pitch" not in held), "insertion", "roll")
+
+
+def test_a_joint_before_a_remote_centre_is_held(tmp_path):
+    text = parallelogram().replace('link="base"/><child link="yawed"', 'link="turned"/><child link="yawed"')
+    wrist = "".join(f'<link name="wrist_{n}">{INERTIAL}</link>' for n in (1, 2))
+    wrist += joint("bend", "shaft", "wrist_1", "0 0 -0.4", "1 0 0", (-1, 1))
+    wrist += joint("sway", "wrist_1", "wrist_2", "0 0 -0.01", "0 1 0", (-1, 1))
+    base = f'<link name="turned">{INERTIAL}</link>' + joint("set_up", "base", "turned", "0 0.2 0", "1 0 0", (-2, 2))
+    description = made(tmp_path, text.replace("</robot>", wrist + base + "</robot>")).description
+    assert description.joints == ("yaw", "pitch", "insertion", "roll", "bend", "sway")
+    assert description.held == {"set_up": 0.0}
+    assert description.trocar.fixed
+    np.testing.assert_allclose(description.trocar.point, CENTRE + np.array([0.0, 0.2, 0.0]), atol=1e-9)
 
 
 def test_a_leader_is_as_fast_as_its_followers_allow(tmp_path):
@@ -338,7 +363,9 @@ def test_initial_values_count_and_followers_lose_their_actuators(tmp_path, drive
     [
         ({"mimic_2": MIMIC("pich", -1, 0)}, "'pich'"),
         ({"mimic_2": MIMIC("fix", -1, 0)}, "'fix'"),
-        ({"mimic_2": MIMIC("pitch_3", -1, 0), "mimic_3": MIMIC("pitch_2", -1, 0)}, "'pitch_2'"),
+        ({"mimic_2": MIMIC("pitch_3", -1, 0), "mimic_3": MIMIC("pitch_2", -1, 0)}, "'pitch_3'"),
+        ({"mimic_1": MIMIC("pitch", 1, 0)}, "'pitch'.*no other joint"),
+        ({"limits_2": (-0.1, -0.1), "limits_3": (0.2, 0.2)}, "'pitch_3'.*0\\.2"),
         ({"mimic_3": MIMIC("pitch", 1, 3)}, "'pitch_3'"),
     ],
 )

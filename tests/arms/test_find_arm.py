@@ -17,7 +17,7 @@ from surgsim_apps.arms.find_arm import find_arm, joint_inertia
 from surgsim_apps.cli.main import main
 from surgsim_env.instruments.arm.arm import load_arm
 from surgsim_env.instruments.arm.model import hold_joints, read_model
-from surgsim_env.instruments.arm.urdf import find_mesh
+from surgsim_env.instruments.arm.urdf import mesh_files
 from surgsim_env.scene.arm_description import AddedShape, LinkInertia, read_description
 from surgsim_env.scene.load import scenes_folder
 from surgsim_env.scene.save import as_toml
@@ -144,7 +144,9 @@ def test_a_mesh_is_found_where_folders_differ(tmp_path, name, place):
     (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / place).write_text("solid")
     (tmp_path / "scope/urdf").mkdir(parents=True, exist_ok=True)
-    mesh = find_mesh(tmp_path / "scope/urdf/arm.urdf", name, "parts")
+    block = '<mujoco><compiler meshdir="parts"/></mujoco>'
+    root = ElementTree.fromstring(f'<robot name="scope">{block}<mesh filename="{name}"/></robot>')
+    mesh = mesh_files(root, tmp_path / "scope/urdf/arm.urdf")[name]
     assert mesh is not None
     assert mesh.samefile(tmp_path / place)
 

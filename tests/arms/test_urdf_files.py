@@ -220,6 +220,7 @@ def test_an_incomplete_inertia_of_a_link_that_does_not_move_is_replaced(tmp_path
         ({"limits": {"j3": LIMIT.replace('"2"', '"fast"')}}, "j3: limit velocity"),
         ({"limits": {"j3": '<mimic joint="j2" multiplier="x"/>'}}, "j3: mimic multiplier"),
         ({"last": '<origin xyz="0, 0, 0.1"/>' + ROUND}, "shaft: origin xyz"),
+        ({"more": '<material name="red"><color rgba="${r} 0 0 1"/></material>'}, "red: color rgba.*xacro"),
         ({"last": '<origin xyz="0 0"/>' + ROUND}, "shaft: origin xyz"),
         ({"last": '<origin xyz="0 0 inf"/>' + ROUND}, "shaft: origin xyz"),
         ({"more": '<x:if xmlns:x="http://www.ros.org/wiki/xacro" value="1"/>'}, "xacro"),
@@ -242,7 +243,7 @@ FOLLOWER = (
 )
 
 
-def test_a_joint_with_equal_limits_is_held_there_with_what_follows_it(tmp_path, capfd):
+def test_a_joint_with_equal_limits_is_held_there_with_what_follows_it(tmp_path, capfd, recwarn):
     path = written(tmp_path, limits={"j4": LOCKED}, more=FOLLOWER)
     description = find_arm(path).description
     assert description.joints == ("j1", "j2", "j3", "j5", "j6")
@@ -251,6 +252,7 @@ def test_a_joint_with_equal_limits_is_held_there_with_what_follows_it(tmp_path, 
     # With the driven joints at 0 the shaft's z axis is turned by 0.3 about x.
     axis = ModelSurvey(path).data.body("shaft").xmat.reshape(3, 3)[:, 2]
     np.testing.assert_allclose(axis, [0.0, -np.sin(0.3), np.cos(0.3)], atol=1e-12)
+    assert not recwarn.list
     assert capfd.readouterr().err == ""
 
 
@@ -266,13 +268,25 @@ def test_crossed_limits_are_put_in_order(plain, tmp_path, capfd):
 
 
 @pytest.mark.parametrize(
-    "limit", ['<limit lower="0" upper="0" effort="0" velocity="0"/>', '<limit lower="-inf" upper="inf"/>', "<limit/>"]
+    "limit",
+    [
+        '<limit lower="0" upper="0" effort="0" velocity="0"/>',
+        '<limit lower="-inf" upper="inf"/>',
+        "<limit/>",
+        '<limit lower="0" upper="-1"/>',
+    ],
 )
 def test_limits_of_zero_or_infinity_are_none(tmp_path, limit):
     survey = ModelSurvey(written(tmp_path, limits={"j4": limit}))
     assert not survey.locked
     assert not survey.model.joint("j4").limited[0]
     assert survey.model.njnt == 6
+
+
+@pytest.mark.parametrize(("limit", "limits"), [('upper="1.2"', (0.0, 1.2)), ('lower="-1.2"', (-1.2, 0.0))])
+def test_a_limit_that_is_not_stated_is_0(tmp_path, limit, limits):
+    survey = ModelSurvey(written(tmp_path, limits={"j4": f"<limit {limit}/>"}))
+    assert survey.range_of(survey.model.joint("j4").id, np.inf) == limits
 
 
 def test_limits_of_mjcf_joints_are_read_likewise(tmp_path):

@@ -28,6 +28,8 @@ TIP_SITE = "surgsim_tip"
 COUPLING_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 # Joints of a URDF that may follow others and be followed.
 URDF_JOINTS = ("revolute", "continuous", "prismatic")
+# Limits that PyBullet writes for a joint without any.
+NO_LIMITS = [0.0, -1.0]
 # Largest size of a model file [bytes]: chosen, MuJoCo would read a larger one for minutes.
 FILE_SIZE_MOST = 200_000_000
 # Colour of a description's added shapes.
@@ -74,7 +76,10 @@ def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, 
 
 @contextmanager
 def warned(where: str) -> Iterator[None]:
-    """Turn MuJoCo's warnings within the block into Python warnings, in place of printed and logged lines."""
+    """Turn MuJoCo's warnings within the block into Python warnings, in place of printed and logged lines.
+
+    Those of equal limits are left out: `_check_joints` and `surgsim arm check` name them.
+    """
     messages: list[str] = []
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(messages.append)
@@ -82,7 +87,7 @@ def warned(where: str) -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(handler)
-        for text in dict.fromkeys(messages):
+        for text in dict.fromkeys(text for text in messages if "limit ignored" not in text):
             warnings.warn(f"{where}: MuJoCo: {' '.join(text.split())}", stacklevel=1)
 
 
@@ -100,11 +105,13 @@ def read_model(path: Path, inertias: Sequence[LinkInertia] = (), dropped_meshes:
     root = read_xml(path)
     if root.tag == "robot":
         _check_leaders(root)
-        limits = prepare_urdf(root, path, inertias, dropped_meshes)
+        prepare_urdf(root, path, inertias, dropped_meshes)
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         spec.modelfiledir = str(path.parent)
-        for joint, pair in limits.items():
-            spec.joint(joint).range, spec.joint(joint).limited = pair, mujoco.mjtLimited.mjLIMITED_FALSE
+        for joint in spec.joints:
+            if np.isinf(joint.range).any() or joint.range.tolist() == NO_LIMITS:
+                joint.range = [0.0, 0.0]
+            joint.limited = mujoco.mjtLimited(int(joint.range[0] < joint.range[1]))
     elif inertias or dropped_meshes:
         name = "inertias" if inertias else "dropped_meshes"
         raise ValueError(f"{name} is for URDF files; model file {path} is MJCF: change it there")
@@ -143,12 +150,13 @@ def _check_leaders(root: ElementTree.Element) -> None:
     """Check that the joints of a URDF follow joints that move: MuJoCo leaves out other couplings."""
     moving = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") in URDF_JOINTS}
     for joint in root.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None and joint.get("name") in moving and mimic.get("joint") not in moving:
-            leader = mimic.get("joint", "")
+        mimic, name = joint.find("mimic"), joint.get("name", "")
+        leader = "" if mimic is None else mimic.get("joint", "")
+        others = moving - {name}
+        if mimic is not None and name in moving and leader not in others:
             raise ValueError(
-                f"joint {joint.get('name')!r} follows {leader!r} by <mimic>, which is no joint that moves"
-                f"{nearest(leader, sorted(moving))}: name one there, or take the <mimic> out"
+                f"joint {name!r} follows {leader!r} by <mimic>, which is no other joint that moves"
+                f"{nearest(leader, sorted(others))}: name one there, or take the <mimic> out"
             )
 
 
@@ -336,9 +344,7 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
 def _narrow_limits(model: mujoco.MjModel, arm: ArmDescription) -> None:
     """Narrow the limits of driven joints to those of the joints that follow them."""
     driven = [model.joint(name).id for name in arm.joints]
-    limited = model.jnt_limited[driven].astype(bool)[:, None]
-    own = np.where(limited, model.jnt_range[driven], [-np.inf, np.inf])
-    narrow = narrowed_limits(model, driven, followers_in(model, arm), own)
+    narrow = narrowed_limits(model, driven, followers_in(model, arm))
     for joint, limits in zip(driven, narrow, strict=True):
         if np.isfinite(limits).all():
             model.jnt_limited[joint], model.jnt_range[joint] = 1, limits

@@ -48,7 +48,7 @@ def check_numbers(root: ElementTree.Element, path: Path) -> None:
     """
     if any("xacro}" in element.tag for element in root.iter()):
         raise ValueError(f"model file {path} is a xacro template: expand it (xacro {path.name} > arm.urdf), name that")
-    for part in (*root.findall("link"), *root.findall("joint")):
+    for part in (*root.findall("link"), *root.findall("joint"), *root.findall("material")):
         for element in part.iter():
             for name, text in element.attrib.items():
                 where = f"model file {path}: {part.tag} {part.get('name', '')}: {element.tag} {name} is {text!r}"
@@ -56,22 +56,22 @@ def check_numbers(root: ElementTree.Element, path: Path) -> None:
                     raise ValueError(f"{where}: run xacro first")
                 count = NUMBERS.get(name) if name != "value" or element.tag == "mass" else None
                 if count and not _are_numbers(text, count, element.tag):
-                    raise ValueError(f"{where}; write {count} number{'s with blanks between them' * (count > 1)}")
+                    raise ValueError(f"{where}; numbers to be written there, with blanks between them: {count}")
 
 
 def _are_numbers(text: str, count: int, tag: str) -> bool:
     """True for as many numbers; those of limits may be infinite."""
     try:
-        values = [float(value) for value in text.split()]
+        values = np.array(text.split(), dtype=np.float64)
     except ValueError:
         return False
-    bad = math.isnan if tag == "limit" else lambda value: not math.isfinite(value)
-    return len(values) == count and (tag in REPLACED or not any(map(bad, values)))
+    finite = ~np.isnan(values) if tag == "limit" else np.isfinite(values)
+    return len(values) == count and (tag in REPLACED or bool(finite.all()))
 
 
 def prepare_urdf(
     root: ElementTree.Element, path: Path, inertias: Sequence[LinkInertia], dropped_meshes: Sequence[str]
-) -> dict[str, tuple[float, float]]:
+) -> None:
     """Change a URDF's elements for MuJoCo.
 
     Args:
@@ -79,9 +79,6 @@ def prepare_urdf(
         path: of the file.
         inertias: of links, in place of the file's own.
         dropped_meshes: file names in the URDF of meshes to be left out with their shapes.
-
-    Returns:
-        Limits [rad or m] that are equal or cross, taken out: MuJoCo ignores them, with a printed warning.
 
     Raises:
         ValueError: a missing mesh file, an unknown link or mesh.
@@ -109,7 +106,6 @@ def prepare_urdf(
         compiler.attrib.pop(name, None)
     compiler.attrib.update({**COMPILER, **compiler.attrib, "fusestatic": "false", "strippath": "false"})
     _set_inertias(root, inertias)
-    return _ignored_limits(root)
 
 
 def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
@@ -138,7 +134,7 @@ def shape_fault(shape: ElementTree.Element) -> str | None:
     values = [float(value) for text in sizes for value in text.split()]
     if all(sizes) and all(0.0 < value < math.inf for value in values):
         return None
-    return f"{solid.tag} of {', '.join(f'{n} {s!r}' for n, s in zip(SIZES[solid.tag], sizes, strict=True))}"
+    return f"{solid.tag} of {', '.join(f'{name} {text!r}' for name, text in solid.attrib.items())}"
 
 
 def shape_faults(root: ElementTree.Element, path: Path) -> tuple[list[str], dict[str, list[str]]]:
@@ -213,11 +209,11 @@ def mesh_files(root: ElementTree.Element, path: Path) -> dict[str, Path | None]:
     folder = stated.get("meshdir", stated.get("assetdir", ""))
     strip = stated.get("strippath") != "false"
     names = dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh"))
-    return {name: find_mesh(path, name, folder, strip) for name in names}
+    return {name: next(filter(Path.is_file, _places(path, name, folder, strip)), None) for name in names}
 
 
-def find_mesh(path: Path, name: str, folder: str = "", strip: bool = True) -> Path | None:
-    """Path of a mesh by its name in a URDF, or None.
+def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
+    """Candidate paths of a mesh: in its stated folder, as named, by less and less of its path below folders above.
 
     Args:
         path: of the URDF.
@@ -225,11 +221,6 @@ def find_mesh(path: Path, name: str, folder: str = "", strip: bool = True) -> Pa
         folder: of the meshes by the URDF's compiler element.
         strip: True if that element takes folders off their names, as by default.
     """
-    return next((place for place in _places(path, name, folder, strip) if place.is_file()), None)
-
-
-def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
-    """Candidate paths of a mesh: in its stated folder, as named, by less and less of its path below folders above."""
     scheme, separator, rest = name.rpartition("://")
     parts = PurePosixPath((rest if separator else name).replace("\\", "/")).parts
     if not parts:
@@ -244,23 +235,6 @@ def _places(path: Path, name: str, folder: str, strip: bool) -> Iterator[Path]:
     for ending in endings:
         yield from (place.joinpath(*ending) for place in above)
     yield from (place / "meshes" / parts[-1] for place in above)
-
-
-def _ignored_limits(root: ElementTree.Element) -> dict[str, tuple[float, float]]:
-    """Take out limits that are equal, cross or are infinite; the first two are returned."""
-    ignored = {}
-    for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
-            continue
-        lower, upper = (float(limit.get(name, 0.0)) for name in ("lower", "upper"))
-        endless = math.isinf(lower) or math.isinf(upper)
-        if not endless and lower >= upper:
-            ignored[joint.get("name", "")] = lower, upper
-        if endless or lower >= upper:
-            limit.attrib.pop("lower", None)
-            limit.attrib.pop("upper", None)
-    return ignored
 
 
 def _set_inertias(root: ElementTree.Element, inertias: Sequence[LinkInertia]) -> None:

@@ -1,12 +1,13 @@
 """The environments' ids: the shipped classes, and environments of a user's own tasks."""
 
-from enum import Enum
+import copyreg
+import os
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from surgsim_env.envs.palpate_sites_env import PalpateSitesEnv
 from surgsim_env.envs.surgical_env import SurgicalEnv
@@ -45,16 +46,16 @@ class Arguments(dict[str, Any]):
     """Arguments of a spec: those of `gym.make` and `gym.make_vec` enter in the form that `EnvSpec.to_json` takes."""
 
     def update(self, *others: Any, **arguments: Any) -> None:
-        """As of any dictionary, with paths as text, members of enumerations as values, numpy's numbers as Python's."""
-        super().update({name: _plain(value) for name, value in dict(*others, **arguments).items()})
+        """As of any dictionary, with paths, modes of autoreset and `dtype` as text, numpy's numbers as Python's."""
+        super().update({name: _plain(name, value) for name, value in dict(*others, **arguments).items()})
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Enum):
+def _plain(name: str, value: Any) -> Any:
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, AutoresetMode):
         return value.value
-    if isinstance(value, type | np.dtype):
+    if name == "dtype" and isinstance(value, type | np.dtype):
         return np.dtype(value).name
     return value.item() if isinstance(value, np.generic) else value
 
@@ -96,12 +97,13 @@ def environment_class(task_class: type[Task]) -> type[SurgicalEnv]:
         if shipped.task_class is task_class:
             return shipped
     name = task_class.__name__.removesuffix("Task") + "Env"
-    own = {"task_class": task_class, "__module__": task_class.__module__, "__reduce__": _pickled}
-    return type(name, (SurgicalEnv,), own)
+    made = type(name, (SurgicalEnv,), {"task_class": task_class, "__module__": task_class.__module__})
+    copyreg.pickle(made, _pickled)  # no module has the class under its name; subclasses have modules of their own
+    return made
 
 
 def _pickled(env: SurgicalEnv) -> tuple[Any, ...]:
-    """An environment of a class that no module has under its name, by its task's class."""
+    """An environment of `environment_class`, by its task's class."""
     return _blank, (type(env).task_class,), vars(env)
 
 

@@ -46,12 +46,11 @@ class VectorEnvForStableBaselines(VecEnv):
             ValueError: options that differ between environments, or what the environments refuse.
         """
         options = self._options[0]
-        for index, other in enumerate(self._options):
-            if other != options:
-                raise ValueError(
-                    f"set_options has {other} for environment {index} and {options} for environment 0; they are reset "
-                    "together: give one dictionary for all"
-                )
+        if other := [given for given in self._options if given != options]:
+            raise ValueError(
+                f"set_options has {options} for environment 0 and {other[0]} for another; they are reset together: "
+                "give one dictionary for all"
+            )
         observation, self.reset_infos = self.envs.reset(seed=list(self._seeds), options=options)  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()

@@ -3,7 +3,6 @@
 import math
 import os
 import threading
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, ClassVar, Literal
@@ -18,7 +17,7 @@ from msdm_core.kernels.vector_kernels import lane_counts
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.lane_group import LaneGroup, core_count
 from surgsim_env.envs import ids
-from surgsim_env.envs.surgical_env import OVER, SurgicalEnv
+from surgsim_env.envs.surgical_env import NOT_BEGUN, OVER, SurgicalEnv
 from surgsim_env.scene.load import require_known
 
 
@@ -144,7 +143,7 @@ class LaneVectorEnv(VectorEnv):
         for lane in np.flatnonzero(begins).tolist():
             self._observations[lane], info = self.envs[lane].reset(seed=seeds[lane], options=options)
             self._paused[lane] = False
-            enter_info(infos, info, lane, self.num_envs)
+            infos = self._add_info(infos, info, lane)
         return self._together(), infos
 
     def pause(self, mask: NDArray[np.bool_]) -> None:
@@ -199,11 +198,11 @@ class LaneVectorEnv(VectorEnv):
                 truncated[lane] |= env.task.step_count >= self._step_limit
                 self._observations[lane] = seen
                 if (terminated[lane] or truncated[lane]) and self.autoreset_mode is AutoresetMode.SAME_STEP:
-                    enter_info(infos, {"final_obs": seen, "final_info": info}, lane, self.num_envs)
+                    infos = self._add_info(infos, {"final_obs": seen, "final_info": info}, lane)
                     resets[lane] = True
             if resets[lane]:
                 self._observations[lane], info = env.reset()
-            enter_info(infos, info, lane, self.num_envs)
+            infos = self._add_info(infos, info, lane)
         return self._together(), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8] | None, ...]:  # type: ignore[override]
@@ -254,21 +253,10 @@ class LaneVectorEnv(VectorEnv):
 
     def _together(self) -> Any:
         """The last observations of all environments."""
+        if missing := [lane for lane, seen in enumerate(self._observations) if seen is None]:
+            raise gym.error.ResetNeeded(f"lane {missing[0]}: {NOT_BEGUN}: reset all environments first")
         space = self.single_observation_space
         return concatenate(space, self._observations, create_empty_array(space, n=self.num_envs))
-
-
-def enter_info(infos: dict[str, Any], info: Mapping[str, Any], lane: int, count: int) -> None:
-    """Add the info of a lane to that of all: for each name an array (count,), and as "_name" the mask of its lanes."""
-    for name, value in info.items():
-        if isinstance(value, Mapping):
-            enter_info(infos.setdefault(name, {}), value, lane, count)
-        else:
-            if name not in infos:
-                kind = type(value) if isinstance(value, bool | int | float | np.number) else object
-                infos[name] = np.full(count, None) if kind is object else np.zeros(count, dtype=kind)
-            infos[name][lane] = value
-        infos.setdefault(f"_{name}", np.zeros(count, dtype=np.bool_))[lane] = True
 
 
 @cache

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.scene.levels import DrawnOrgan
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.load import make_scene, require_known
 from surgsim_env.scene.model import Scene
 
 # Full scale of a velocity command [m/s].
@@ -176,7 +176,9 @@ class Reward:
     def __post_init__(self) -> None:
         if self.per == "change" and self.value is None:
             raise ValueError(f"reward {self.name!r} pays a change, but has no value that could: give `value`")
-        if not math.isfinite(self.weight):
+        require_known("period", self.per, PERIODS)
+        weight = real_numbers(self.weight, "weight of reward", self.name)
+        if weight.ndim or not np.isfinite(weight):
             raise ValueError(f"reward {self.name!r}: weight is {self.weight}; it must be a finite number")
 
 
@@ -212,8 +214,8 @@ def real_numbers(value: Any, owner: str, name: str) -> FloatArray:
         numbers = np.asarray(value)
     except ValueError:  # rows of different lengths
         numbers = np.array(None)
-    if numbers.dtype.kind not in "biuf":
-        raise ValueError(f"{owner} {name!r} gives {reprlib.repr(value)}; give real numbers")
+    if numbers.dtype.kind not in "biuf" or np.ma.is_masked(value):
+        raise ValueError(f"{owner} {name!r} gives {reprlib.repr(value)}; give numbers of type float")
     return numbers.astype(np.float64, copy=False)
 
 

@@ -112,7 +112,7 @@ class TaskLayout:
         )
 
     def reading(self, channel: Channel, size: int, simulation: Simulation) -> FloatArray:
-        """What a channel reads from the simulation, in front of its sensor, shape (size,).
+        """Numbers of a channel from the simulation, in front of its sensor, shape (size,).
 
         Raises:
             ValueError: other than real numbers, or another size.

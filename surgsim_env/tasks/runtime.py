@@ -5,6 +5,7 @@ import inspect
 import io
 import json
 import math
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -65,6 +66,12 @@ class TaskRuntime:
         own = task.anatomy.scene.sensor
         self.sensors = {channel.name: ForceReading(_scaled(own, channel.sensor)) for channel in self.layout.sensed}
         declared = [reward.name for reward in task.rewards if reward.per == "failure"]
+        for reward in task.rewards:
+            if reward.per == "step left" and reward.value is None and task.episode_steps is None:
+                raise ValueError(
+                    f"{type(task).__name__}: reward {reward.name!r} pays the control steps left, and the task has no "
+                    "episode_steps: give Setup.episode_steps, or the reward a value"
+                )
         self.failures = tuple(dict.fromkeys(("fault", *declared, "hard_force", DAMAGE)))
         # A subclass may leave out terms whose ends its base returns.
         terms = [term for base in type(task).__mro__ for term in vars(base).get("rewards", ())]
@@ -360,10 +367,14 @@ def _kept_form(value: Any, name: str) -> Any:
     if (kind is np.ndarray or isinstance(value, np.generic)) and not value.dtype.hasobject:
         buffer = io.BytesIO()
         np.save(buffer, value, allow_pickle=False)
-        return {"array" if kind is np.ndarray else "scalar": base64.b64encode(buffer.getvalue()).decode()}
+        form = {"array" if kind is np.ndarray else "scalar": base64.b64encode(buffer.getvalue()).decode()}
+        # The file has no types of other packages, no records and no zeros at the end of a text.
+        if repr(_kept_value(form).dtype) == repr(value.dtype):
+            return form
     raise TypeError(
-        f"kept attribute {name!r} holds a {kind.__name__}; a saved state holds numbers, texts, numpy's arrays and "
-        "scalars, and lists, tuples and dictionaries of these: keep such, and make the rest from them"
+        f"kept attribute {name!r} holds {reprlib.repr(value)} ({kind.__name__}); a saved state holds numbers, texts, "
+        "numpy's arrays and scalars of plain types, and lists, tuples and dictionaries of these: keep such, and make "
+        "the rest from them"
     )
 
 

@@ -3,7 +3,9 @@
 import inspect
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +14,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from surgsim_env.envs.ids import TASKS
+from surgsim_env.envs.ids import TASKS, register_task
 from surgsim_env.envs.surgical_env import SurgicalEnv
 from surgsim_env.envs.vector_env import LaneVectorEnv
 from surgsim_env.rendering.options import RenderOptions
@@ -140,6 +142,37 @@ def test_a_spec_holds_every_argument_as_json(env_id):
     for record, other in zip(rollout(env, seed=3, steps=3), rollout(again, seed=3, steps=3), strict=True):
         assert record[0].tobytes() == other[0].tobytes() and record[1:] == other[1:]
     assert env.unwrapped.save_state() == again.unwrapped.save_state()
+
+
+class Side(Enum):
+    LEFT = "left"
+
+
+@dataclass
+class ScenePath:
+    """A path of another library's class."""
+
+    path: Path = SMALL["scene"]
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+
+class Sided(TASKS[OWN]):  # type: ignore[misc]
+    """A task with arguments of its own."""
+
+    def __init__(self, scenario: Any, *, side: Any = None, kind: Any = None) -> None:
+        super().__init__(scenario)
+        self.given = side, kind
+
+
+def test_a_task_takes_its_own_arguments_as_they_are(monkeypatch):
+    monkeypatch.setitem(gym.registry, "Test/Sided-v0", None)
+    register_task("Test/Sided-v0", Sided)
+    env = gym.make("Test/Sided-v0", scene=ScenePath(), side=Side.LEFT, kind=ScenePath)
+    assert env.unwrapped.task.given == (Side.LEFT, ScenePath)
+    env = gym.make("Test/Sided-v0", scene=ScenePath(), side="left")
+    assert EnvSpec.from_json(env.spec.to_json()).kwargs == {"scene": str(SMALL["scene"]), "side": "left"}
 
 
 @pytest.mark.parametrize("env_id", LANES)

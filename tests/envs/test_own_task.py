@@ -1,5 +1,8 @@
 """A task follows from its declaration: one more channel or reward is one place; what is wrong with one is refused."""
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -261,6 +264,11 @@ def test_a_channel_that_leaves_its_bounds_later_is_a_fault():
 # ---- a task's own numbers, ends and draws ----------------------------------------------------------------------------
 
 STILL = np.zeros(3, dtype=np.float32)
+MASKED = np.ma.array(0.5, mask=True)
+
+
+class OfTouch(environment_class(Touch)):
+    """A user's own class of an environment."""
 
 
 def played(**attributes):
@@ -271,7 +279,9 @@ def played(**attributes):
 
 
 @pytest.mark.parametrize("per", ["step", "change"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1j, np.complex128(1.0), None, "1", np.ones(2), []])
+@pytest.mark.parametrize(
+    "value", [np.nan, np.inf, -np.inf, 1j, np.complex128(1.0), None, "1", np.ones(2), [], np.ma.masked, MASKED]
+)
 def test_a_reward_that_is_no_finite_number_is_named(value, per):
     late = lambda task, step: value if task.step_count else 0.0  # noqa: E731
     for amount in (late, lambda task, step: value):
@@ -279,10 +289,20 @@ def test_a_reward_that_is_no_finite_number_is_named(value, per):
             played(rewards=(Reward("time", -1.0, "step"), Reward("odd", 1.0, per, "", amount)))
 
 
-@pytest.mark.parametrize("weight", [np.nan, np.inf])
+@pytest.mark.parametrize("weight", [np.nan, np.inf, 1j, "1", None, np.ones(1), MASKED])
 def test_a_weight_that_is_not_finite_is_refused(weight):
     with pytest.raises(ValueError, match="'odd'"):
         Reward("odd", weight, "step")
+
+
+def test_a_period_that_no_reward_has_is_named():
+    with pytest.raises(ValueError, match="'sucess'"):
+        Reward("odd", 1.0, "sucess")  # type: ignore[arg-type]
+
+
+def test_steps_left_need_a_number_of_steps():
+    with pytest.raises(ValueError, match="'odd'"):
+        played(setup=Setup(scene="phantom_small", episode_steps=None), rewards=(Reward("odd", -1.0, "step left"),))
 
 
 @pytest.mark.parametrize("value", [0.5, np.float32(0.5), np.array(0.5), True, 2])
@@ -315,6 +335,7 @@ def test_a_declared_end_ends_the_episode(end):
         lambda point, normal: (point + 0.012 * normal)[:2],
         lambda point, normal: 0.05,
         lambda point, normal: None,
+        lambda point, normal: np.ma.array(point + 0.012 * normal, mask=[0, 0, 1]),
     ],
 )
 def test_a_tip_inside_the_organ_or_nowhere_is_named(tip):
@@ -337,7 +358,7 @@ def test_after_a_reset_that_raised_nothing_is_played_or_saved():
 
 
 @pytest.mark.parametrize(
-    "value", [0.5 + 0.1j, np.complex64(0.5), "0.5", None, [0.5, [0.1]], np.array([0.5], dtype=object)]
+    "value", [0.5 + 0.1j, np.complex64(0.5), "0.5", None, [0.5, [0.1]], np.array([0.5], dtype=object), MASKED]
 )
 def test_a_read_that_is_no_real_number_is_named(value):
     with pytest.raises(ValueError, match="'one'"):
@@ -349,6 +370,13 @@ def test_a_read_in_front_of_a_sensor_has_three_real_numbers(value):
     force = Channel("force", 3, "N", sensor=1.0, scale=1.0, read=lambda *_: value)
     with pytest.raises(ValueError, match="'force'"):
         played(channels=(force,))
+
+
+def test_a_pickled_subclass_is_of_its_own_class():
+    env = OfTouch()
+    for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        assert type(twin) is OfTouch
+    assert type(pickle.loads(pickle.dumps(environment_class(Touch)()))) is environment_class(Touch)
 
 
 # ---- kept attributes -------------------------------------------------------------------------------------------------
@@ -397,6 +425,10 @@ def test_kept_values_come_back_as_they_were(value):
         1j,
         [1, {1}],
         {"a": (b"a",)},
+        # Of other bits after numpy's file: a record's type, a text's last zero, a text of variable length.
+        np.rec.array([(1, 2.0)])[0],
+        [np.bytes_(b"a\0")],
+        np.array(["a"], np.dtypes.StringDType()),
     ],
     ids=lambda value: type(value).__name__,
 )

@@ -226,6 +226,21 @@ def test_a_reset_that_does_not_fit_is_refused(given: dict, message: str):
         side_by_side().reset(**given)
 
 
+def test_an_environment_without_an_episode_is_named():
+    envs = side_by_side()
+    with pytest.raises(gym.error.ResetNeeded, match="lane 1"):
+        envs.reset(options={"reset_mask": np.array([True, False, False])})
+
+
+def test_last_observations_of_tables_are_those_of_environments_one_after_the_other():
+    settings = {"obs_mode": "rgb_force", "max_episode_steps": 1}
+    results = []
+    for envs in (side_by_side(autoreset_mode="SameStep", **settings), one_after_the_other("SameStep", **settings)):
+        envs.reset(seed=5)
+        results.append(envs.step(actions(0)))
+    assert_equal(*results)
+
+
 def test_a_pause_that_does_not_fit_is_refused():
     for mask in (np.ones(2, dtype=np.bool_), np.ones(3)):
         with pytest.raises(ValueError, match="mask is "):

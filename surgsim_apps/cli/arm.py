@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -171,8 +172,9 @@ def _public_model(name: str, console: Console) -> Path:
         command = [sys.executable, "-m", "robot_descriptions", "pull", name]
         pulled = subprocess.run(command, capture_output=True, text=True, check=False)
     if pulled.returncode != 0:
-        # The last line of a traceback.
-        _, _, reason = pulled.stderr.strip().rpartition("\n")
+        # The exception at the end of a traceback, without progress bars.
+        ended = re.split(r"^(?=[\w.]+Error)", pulled.stderr, flags=re.MULTILINE)[-1]
+        reason = " ".join(line for line in ended.splitlines() if "it/s" not in line)
         raise ValueError(f"robot_descriptions could not give {name}: {reason}")
     return Path(pulled.stdout.splitlines()[-1])
 

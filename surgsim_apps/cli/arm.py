@@ -146,8 +146,7 @@ class Arm:
             )
             return 1
         console.print(
-            "try it (refused where the tip does not reach the scene's face from its port): "
-            f'gymnasium.make("SurgSim/Palpate-v0", scene="phantom", instrument="{folder / names[0]}")',
+            f'try it: gymnasium.make("SurgSim/Palpate-v0", scene="phantom", instrument="{folder / names[0]}")',
             highlight=False,
             soft_wrap=True,
         )

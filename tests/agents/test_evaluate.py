@@ -176,7 +176,7 @@ def test_wrong_options_are_refused() -> None:
         (["--agent", "expert_retract", "--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
         (["--agent", "expert_retract", "--budget", "3"], "--budget is the number of presses"),
         (["--agent", "expert_retract", "--no-tracking"], "--no-tracking is for the presses"),
-        (["--compare", "gp_ucb.json", "nobody.json"], "gp_ucb.json is no result"),
+        (["--compare", "gp_ucb.json", "nobody.json"], "gp_ucb.json: No such file"),
     ],
 )
 def test_what_cannot_be_played_is_refused(arguments: list[str], message: str) -> None:

@@ -244,7 +244,7 @@ class Anatomy:
     def centres_below(self, points: FloatArray, normals: FloatArray, distance: float) -> FloatArray:
         """Points on the inward normals (n, 3) of points (n, 3) [m] at a distance from the organ's surface [m], (n, 3).
 
-        NaN if there is none, because another side of the organ is near.
+        NaN if there is none inside the organ, because another side of it is near.
         """
         depth = np.full(len(points), distance)
         centres, pending = np.full((len(points), 3), np.nan), np.arange(len(points))
@@ -258,6 +258,10 @@ class Anatomy:
             pending = pending[~met & (np.abs(depth[pending] - distance) <= 0.01)]
             if not len(pending):
                 break
+        for index in np.flatnonzero(np.isfinite(centres).all(axis=1)):
+            # Beyond a thin wall a point is as far from the surface as inside.
+            if not self._nearest_surface(centres[index])[1]:
+                centres[index] = np.nan
         return centres
 
     @cached_property
@@ -275,10 +279,7 @@ class Anatomy:
         if lesion.region is not None or lesion.radius is None:
             return
         centre = np.asarray(lesion.centre, dtype=np.float64)
-        triangle, weights = self._surface(centre)
-        corners = self._surface.corners[triangle]
-        nearest = matmul(weights, corners)
-        inward = matmul(nearest - centre, np.cross(corners[1] - corners[0], corners[2] - corners[0])) > 0.0
+        nearest, inward = self._nearest_surface(centre)
         depth = float(norm(nearest - centre))
         x, y, z = nearest * 1e3
         if not inward:
@@ -292,6 +293,14 @@ class Anatomy:
                 f"{(lesion.radius - depth) * 1e3:.3g} mm at {x:.1f}, {y:.1f}, {z:.1f} mm: move it deeper or make it "
                 "smaller"
             )
+
+    def _nearest_surface(self, point: FloatArray) -> tuple[FloatArray, bool]:
+        """Nearest point of the surface to a point [m], both (3,), and true for a point on its inner side."""
+        triangle, weights = self._surface(point)
+        corners = self._surface.corners[triangle]
+        nearest = matmul(weights, corners)
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        return nearest, bool(matmul(nearest - point, normal) > 0.0)
 
     @cached_property
     def _surface(self) -> NearestTriangle:

@@ -119,6 +119,16 @@ def test_a_scene_chooses_the_stiffness_rule():
         changed(stiffness_rule="fited")
 
 
+def test_no_centre_of_a_lesion_lies_beyond_a_thin_wall():
+    """5 mm past a wall of 6 mm there is a point 5 mm from the surface, too: outside."""
+    wall = {"size": [0.06, 0.06, 0.006], "cells": [20, 20, 2]}
+    side = {"name": "side", "box": {"lower": [-0.001] * 3, "upper": [0.0001, 0.061, 0.01]}}
+    anatomy = load_anatomy(changed(mesh__block=wall, anchors=[side], palpation__thickness_smallest=0.005))
+    points, normals = np.array([[0.03, 0.03, 0.006]]), np.array([[0.0, 0.0, 1.0]])
+    assert np.isnan(anatomy.centres_below(points, normals, 0.005)).all()
+    np.testing.assert_allclose(anatomy.centres_below(points, normals, 0.002), [[0.03, 0.03, 0.004]], atol=1e-4)
+
+
 def test_mass_scaling_lets_a_scene_do_with_fewer_substeps():
     """A lesion that asks for four substeps runs with three; what was added is told at reset."""
     table = {"timing__mass_scaling": True, "lesion__modulus_ratio": [14.0, 14.0], "lesion__radius": [0.01, 0.01]}

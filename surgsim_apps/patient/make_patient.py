@@ -95,7 +95,7 @@ def make_patient(
         raise ValueError(f"--mesher is {mesher!r}; it must be {' or '.join(MESHERS)}")
     check_options(options)
     first, source = files[0], ", ".join(file.name for file in files)
-    with progress.step(f"reading {source}"), _noted() as notes:
+    with progress.step(f"reading {source}"), _noted(files) as notes:
         if is_image(first):
             wrong = [file for file in files if not is_image(file)]
             if wrong:
@@ -151,12 +151,15 @@ def make_patient(
 
 
 @contextmanager
-def _noted() -> Iterator[list[str]]:
-    """Texts of the warnings within, for the report; they are shown when they arise."""
+def _noted(files: Sequence[Path]) -> Iterator[list[str]]:
+    """Texts of the warnings within, for the report, without the folders of files; they are shown when they arise."""
     notes, show = list[str](), warnings.showwarning
 
     def note(message: Warning | str, *place: Any) -> None:
-        notes.append(str(message))
+        text = str(message)
+        for file in files:
+            text = text.replace(str(file), file.name)
+        notes.append(text)
         show(message, *place)
 
     with warnings.catch_warnings():

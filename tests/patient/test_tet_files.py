@@ -1,6 +1,7 @@
 """A file of tets becomes a patient: with its own tets, or its surfaces filled anew."""
 
 import re
+import warnings
 from pathlib import Path
 
 import meshio
@@ -14,6 +15,7 @@ from msdm_core.mesh_files.mesh_io import read_mesh, write_mesh
 from msdm_core.meshing.lattice_meshing import box_mesh
 from surgsim_apps.cli.main import main
 from surgsim_apps.patient.label_image import parse_labels
+from surgsim_apps.patient.make_patient import _noted
 from surgsim_apps.patient.tet_files import patient_of_tets, read_tets, surfaces_of_tets
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import load_scene
@@ -153,3 +155,10 @@ def test_notes_are_shown_before_a_later_step_fails(tmp_path, capsys, kind):
     assert main(["organ", str(file), *given]) == 2
     *notes, error = capsys.readouterr().err.splitlines()
     assert any("surgsim: warning" in note and noted in note for note in notes) and "stone" in error
+
+
+def test_notes_of_the_report_name_files_without_their_folder(tmp_path):
+    file = tmp_path / "a.vtu"
+    with pytest.warns(UserWarning, match=str(tmp_path)), _noted([file]) as notes:
+        warnings.warn(f"{file}: 3 nodes are left out", stacklevel=2)
+    assert notes == ["a.vtu: 3 nodes are left out"]

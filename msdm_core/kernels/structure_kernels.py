@@ -98,6 +98,8 @@ MODEL_FIELDS = (
     _field("averages_volume", "", "", "own", "True if any node_bulk is above 0", "bool"),
     _field("surface_triangles", "", "n_surface 3", "rows", "triangles open to contact, outward", "int32"),
     _field("surface_rest_area", "m^2", "n_surface", "rows", ""),
+    _field("surface_around", "", "n_surface n_around", "rows", "nodes around each triangle, see EdgeRise", "int32"),
+    _field("surface_rise", "", "n_surface n_around 3", "rows", "their weights in the rise of its edges"),
     _field("support_kind", "", "n_support", "shared", "solids below it, PLANE, SPHERE, ...", "int32"),
     _field("support_position", "m", "n_support 3", "shared", "middle of each, or a plane's point"),
     _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world as columns"),
@@ -203,6 +205,8 @@ class OrganModel(NamedTuple):
     averages_volume: bool
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
+    surface_around: NDArray[np.int32]
+    surface_rise: FloatArray
     support_kind: NDArray[np.int32]
     support_position: FloatArray
     support_rotation: FloatArray

@@ -8,6 +8,7 @@ from msdm_core.arithmetic import dot, eigh, log, matmul, norm
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
     QUADRATURE_COUNT,
+    QUADRATURE_RISE,
     QUADRATURE_WEIGHT,
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
@@ -148,7 +149,8 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
     corners = state.node_position[model.surface_triangles]
     normal = area_vectors(corners)
     normal /= norm(normal, axis=1)[:, None]
-    points = matmul(QUADRATURE_BARYCENTRIC, corners)
+    rise = matmul(model.surface_rise.transpose(0, 2, 1), state.node_position[model.surface_around])
+    points = matmul(QUADRATURE_BARYCENTRIC, corners) + matmul(QUADRATURE_RISE, rise)
     energy = 0.0
     for shape, radius in enumerate(shapes.shape_radius):
         start, axis = shapes.shape_ends[shape, 0], np.diff(shapes.shape_ends[shape], axis=0)[0]

@@ -6,13 +6,14 @@ follows from the places of the other nodes, by a quadratic fit around the edge.
 """
 
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
 from msdm_core.arithmetic import dot, eigh, norm, solve
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, area_vectors
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, area_vectors
 
 # Cosine of the largest angle between the normals of an edge and of a triangle of its neighbourhood: the fit does not
 # reach across creases.
@@ -36,6 +37,16 @@ class EdgeRise(NamedTuple):
 
     node: IntArray
     weight: FloatArray
+
+
+_RISES: WeakKeyDictionary[TetMesh, EdgeRise] = WeakKeyDictionary()
+
+
+def boundary_rise(mesh: TetMesh) -> EdgeRise:
+    """Rise of the edges of a mesh's boundary triangles, computed once per mesh."""
+    if mesh not in _RISES:
+        _RISES[mesh] = edge_rise(mesh.points, mesh.boundary_triangles)
+    return _RISES[mesh]
 
 
 def edge_rise(points: FloatArray, triangles: NDArray[np.integer]) -> EdgeRise:

@@ -40,4 +40,4 @@ def test_nodes_share_out_the_volume_and_its_modulus():
 
 def test_regions_without_excess_give_nothing():
     springs, volume = np.array([1000.0, 1000.0, 1000.0]), np.array([0.0, 1200.0, 1500.0])
-    np.testing.assert_allclose(averaged_volume_modulus(springs, volume), [0.0, 0.0, 300.0], atol=1e-9)
+    np.testing.assert_allclose(averaged_volume_modulus(mesh, springs, volume), [0.0, 0.0, 300.0], atol=1e-9)

@@ -16,7 +16,7 @@ from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 SQUEEZED_RATIO = 0.6
 # Rise of a spring's tangent over that at rest above which the spring is steep: its rise is then integrated implicitly.
 # A smaller rise counts in `stability.stable_dt`.
-STEEP_EXCESS = 0.1
+STEEP_EXCESS = 0.05
 # Added to strains in denominators.
 STRAIN_LEAST = 1e-30
 
@@ -46,16 +46,16 @@ def spring_energy(length, rest_length, stiffness):
 
 @njit(**INLINED)
 def strain_square(energy, softness):
-    """Square of the equivalent strain of a node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs (`Stiffening`).
+    """Square of the equivalent strain of a node, s^2 = 2 U_a / (E_a V_a) (`Stiffening`).
 
-    In: energy: sum k (l - l0)^2 [J], softness: 5 / sum k l0^2 [1/J]
+    In: energy: 4 U_a [J], softness: 1 / (2 E_a V_a) [1/J]
     """
     return energy * softness
 
 
 @njit(**INLINED_KERNEL)
 def node_law(square, onset, growth, excess):
-    """Half of a node's factor w'(s) / s on linear tension, and the rise w'' - 1 of its tangent.
+    """Half of a node's factor w'(s) / s on linear tensions, and the rise w'' - 1 of their tangent.
 
     (1 + (c - 1) (e1 - e0) (v^3 / 3 + (u - v)) / s) / 2 and (c - 1) v^2, with u = (s - e0) / (e1 - e0) and v its part
     within 0, 1.
@@ -117,16 +117,16 @@ def six_rates(b, c, d, b_rate, c_rate, d_rate):
 
 
 @njit(**INLINED)
-def tet_scale(ratio, bulk, averaged_bulk, averaged_tension):
+def tet_scale(ratio, own_tension, averaged_bulk, averaged_tension):
     """Factor from six times the gradients dV/dx to the forces of a tet on its corners: minus a sixth of its tension.
 
-    The tension is K (J - 1), plus the mean tension of the volumes averaged at its corners, plus K' (J - s) s / J for J
-    below s = SQUEEZED_RATIO.
+    The tension is its own, of K (J - 1), plus the mean tension of the volumes averaged at its corners, plus
+    K' (J - s) s / J for J below s = SQUEEZED_RATIO.
 
-    In: ratio J, bulk K [Pa], averaged_bulk K' [Pa], averaged_tension [Pa]
+    In: ratio J, own_tension [Pa], averaged_bulk K' [Pa], averaged_tension [Pa]
     Returns [Pa].
     """
-    tension = bulk * (ratio - 1.0) + averaged_tension
+    tension = own_tension + averaged_tension
     # A quotient takes as long as ten products.
     if any_below(ratio, SQUEEZED_RATIO):
         tension = tension + averaged_bulk * (below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio))
@@ -143,11 +143,19 @@ def volume_ratio(six_volume, inverse_volume):
 
 
 @njit(**INLINED)
-def node_tension(sum_of_six_volumes, inverse_volume, bulk):
-    """Tension of the volume averaged at a node, K_a (J_a - 1) (averaged volumes: Bonet and Burton 1998).
+def averaged_change(sum_of_six_volumes, inverse_volume):
+    """Relative change of the volume averaged at a node, J_a - 1 (averaged volumes: Bonet and Burton 1998).
 
     In: sum_of_six_volumes: of the node's tets, 24 times the averaged volume, a quarter of each [m^3], inverse_volume:
-        1 / the averaged volume at rest [1/m^3], bulk K_a [Pa]
-    Returns [Pa].
+        1 / the averaged volume at rest [1/m^3]
     """
-    return bulk * (sum_of_six_volumes * (inverse_volume * (1.0 / 24.0)) - 1.0)
+    return sum_of_six_volumes * (inverse_volume * (1.0 / 24.0)) - 1.0
+
+
+@njit(**INLINED)
+def volume_energy(change, bulk, volume):
+    """Twice the energy of a volume without stiffening, K V0 (J - 1)^2 [J].
+
+    In: change J - 1, bulk K [Pa], volume V0 [m^3]
+    """
+    return bulk * volume * (change * change)

@@ -224,13 +224,14 @@ def _corner_sums(builder: ir.IRBuilder, values: _Numbers) -> Any:
 
 
 def _pair_sums(builder: ir.IRBuilder, pairs: _Numbers) -> list[Any]:
-    totals, ends = [], []
+    totals, ends, corners = [], [], []
     for item in range(GROUP):
         at_ends = builder.fadd(pairs.load(item, 0, _PAIR), pairs.load(item, 1, _PAIR))
         total = builder.fadd(builder.fadd(at_ends, pairs.load(item, 2, _PAIR)), pairs.load(item, 3, _PAIR))
         totals.append(_entry(builder, total, 0))
         ends.append(_entry(builder, at_ends, 1))
-    return [_pack(builder, totals), _pack(builder, ends)]
+        corners.append(_entry(builder, total, 1))
+    return [_pack(builder, totals), _pack(builder, ends), _pack(builder, corners)]
 
 
 def _push_corners(builder: ir.IRBuilder, force: _Numbers, vectors: Any) -> None:
@@ -248,10 +249,10 @@ def _add_at_corners(builder: ir.IRBuilder, total: _Numbers, six: Any) -> None:
 
 
 def _add_pairs(builder: ir.IRBuilder, pairs: _Numbers, vectors: Any) -> None:
-    zeros = ir.Constant(_VECTOR, [0.0] * GROUP)
+    six, ends, others = vectors
     for item in range(GROUP):
         places = (item, item + GROUP)
-        at_ends, elsewhere = _shuffle(builder, vectors, places), _shuffle(builder, (vectors[0], zeros), places)
+        at_ends, elsewhere = _shuffle(builder, (six, ends), places), _shuffle(builder, (six, others), places)
         for corner, value in enumerate((at_ends, at_ends, elsewhere, elsewhere)):
             pairs.add(item, corner, value)
 
@@ -260,11 +261,13 @@ def _add_pairs(builder: ir.IRBuilder, pairs: _Numbers, vectors: Any) -> None:
 tet_edges = _define_read(4, 4, types.UniTuple(types.UniTuple(VECTOR, 3), 3), _tet_edges)
 # Sums over the corners, from numbers.
 corner_sums = _define_read(4, 1, VECTOR, _corner_sums)
-# Sums of the first numbers over the corners, and of the second over the ends of the tet's spring, from pairs.
-pair_sums = _define_read(4, 2, types.UniTuple(VECTOR, 2), _pair_sums)
+# Sums of the first numbers over the corners, of the second over the ends of the tet's spring and over the corners, from
+# pairs.
+pair_sums = _define_read(4, 2, types.UniTuple(VECTOR, 3), _pair_sums)
 # Vectors of x, y and z added to the rows of the corners 1, 2 and 3, their sum subtracted at corner 0.
 push_corners = _define_add(4, 4, _push_corners)
 # A vector added to the numbers of all corners.
 add_at_corners = _define_add(4, 1, _add_at_corners)
-# A vector added to the first numbers of all corners' pairs, another to the second numbers at the tet's spring's ends.
+# A vector added to the first numbers of all corners' pairs, others to the second numbers at the ends of the tet's spring
+# and at its other corners.
 add_pairs = _define_add(4, 2, _add_pairs)

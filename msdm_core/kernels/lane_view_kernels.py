@@ -21,11 +21,11 @@ from msdm_core.kernels.structure_kernels import (
 )
 
 
-class SpringLaw(NamedTuple):
-    """Departures of springs from linear springs in one substep.
+class TissueLaw(NamedTuple):
+    """Departures of tissue from linear elasticity in one substep.
 
     Fields:
-        stiffens: True if springs of any node have a factor other than 1
+        stiffens: True if any node has a factor other than 1
         steepens: True if any node has a steepness above STEEP_EXCESS
         fades: True if the arms relax in this substep
         fade: relative loss of tension of each arm then

@@ -207,29 +207,32 @@ def add_to_corners(lanes, total, tets, tet, value):
 
 
 @njit(**INLINED)
-def add_volume_and_energy(lanes, pairs, tets, tet, volume, energy):
-    """Add to the first numbers of the pairs at a tet's corners, and to the second numbers at the ends of its spring.
+def add_volume_and_energies(lanes, pairs, tets, tet, volume, at_ends, elsewhere):
+    """Add to the first numbers of the pairs at a tet's corners, and to the second ones at its spring's ends, elsewhere.
 
     All loads come before the stores: the compiler cannot know that the places differ.
     """
     a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
     volume_a, volume_b = load_half(lanes, pairs, a, 0) + volume, load_half(lanes, pairs, b, 0) + volume
     volume_c, volume_d = load_half(lanes, pairs, c, 0) + volume, load_half(lanes, pairs, d, 0) + volume
-    energy_a, energy_b = load_half(lanes, pairs, a, 1) + energy, load_half(lanes, pairs, b, 1) + energy
+    energy_a, energy_b = load_half(lanes, pairs, a, 1) + at_ends, load_half(lanes, pairs, b, 1) + at_ends
+    energy_c, energy_d = load_half(lanes, pairs, c, 1) + elsewhere, load_half(lanes, pairs, d, 1) + elsewhere
     store_half(lanes, pairs, a, 0, volume_a)
     store_half(lanes, pairs, b, 0, volume_b)
     store_half(lanes, pairs, c, 0, volume_c)
     store_half(lanes, pairs, d, 0, volume_d)
     store_half(lanes, pairs, a, 1, energy_a)
     store_half(lanes, pairs, b, 1, energy_b)
+    store_half(lanes, pairs, c, 1, energy_c)
+    store_half(lanes, pairs, d, 1, energy_d)
 
 
 @njit(**INLINED)
-def corner_mean_of_pairs(lanes, pairs, tets, tet):
-    """Mean of the first numbers of pairs at the corners of a tet."""
-    return 0.25 * (
-        load_half(lanes, pairs, tets[tet, 0], 0) + load_half(lanes, pairs, tets[tet, 1], 0)
-        + load_half(lanes, pairs, tets[tet, 2], 0) + load_half(lanes, pairs, tets[tet, 3], 0)
+def corner_sum_of_pairs(lanes, pairs, tets, tet, half):
+    """Sum of the first (0) or second (1) numbers of pairs at the corners of a tet."""
+    return (
+        load_half(lanes, pairs, tets[tet, 0], half) + load_half(lanes, pairs, tets[tet, 1], half)
+        + load_half(lanes, pairs, tets[tet, 2], half) + load_half(lanes, pairs, tets[tet, 3], half)
     )  # fmt: skip
 
 

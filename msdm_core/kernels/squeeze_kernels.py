@@ -17,7 +17,6 @@ from msdm_core.kernels.layout_kernels import (
     group_width,
     load_column,
     load_item,
-    load_shared,
     set_node,
     store_column,
     take_from_node,
@@ -40,6 +39,7 @@ from msdm_core.kernels.vector_kernels import any_below, keep_lower
 # 16 sweeps are stable up to 29, 38 and 49 times that tangent at the step of the linear organ; a factor of 1 needs twice
 # as many sweeps.
 STEEP_HOLD = 3.0
+VOLUME_HOLD = 0.35
 # Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
 # ends' speeds by a pull of 1 N, and its pull so far.
 STEEP_WIDTH = 6
@@ -144,8 +144,8 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
     Out: force of the nodes, added to
     """
     position, velocity, force = nodes_of(lanes, state)
-    nodes, stiffness, inverse_mass = model.spring_nodes, model.spring_stiffness, model.node_inverse_mass
-    gain, relaxes, tet_count, width = model.spring_gain, model.relaxes, model.tet_nodes.shape[0], group_width(lanes)
+    nodes, hold, inverse_mass = model.spring_nodes, model.spring_hold, model.node_inverse_mass
+    tet_count, width = model.tet_nodes.shape[0], group_width(lanes)
     steepness, steep, places = state.node_steepness, state.steep_springs, state.steep_places
     rows, speed = state.steep_rows, state.steep_speed
     held = 0
@@ -161,11 +161,8 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             largest = keep_lower(more, largest, largest, more)
             along = difference(lanes, position, nodes, spring, 1)
             along = divided(along, spring_length(along))
-            tangent = STEEP_HOLD * load_item(lanes, stiffness, spring) * more
-            if relaxes:
-                tangent = tangent * load_shared(lanes, steepness, gain, spring)
             # Each of several organs side by side has its own steep springs.
-            tangent = keep_lower(none + STEEP_EXCESS, more, tangent, none)
+            tangent = keep_lower(none + STEEP_EXCESS, more, load_item(lanes, hold, spring) * more, none)
             give = dt * load_item(lanes, inverse_mass, i) + dt * load_item(lanes, inverse_mass, j)
             places[held] = spring
             store_column(lanes, rows, STEEP_WIDTH, held, 0, along[0])

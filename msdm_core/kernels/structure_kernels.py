@@ -66,8 +66,8 @@ def _field(name: str, unit: str, shape: str, lanes: str, meaning: str, dtype: st
     return Field(name, unit, lengths, lanes, meaning, dtype)
 
 
-# Lengths: n_soft is n_node, n_steep n_spring and n_relaxing n_spring, or 0 if no spring stiffens or relaxes; n_arm is
-# 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.state.state_sizes`.
+# Lengths: n_soft is n_node, n_steep n_spring and n_relaxing n_spring + n_tet + n_node (springs, tets, averaged volumes:
+# the elements that relax), or 0 if no tissue stiffens or relaxes; n_arm is 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.state.state_sizes`.
 MODEL_FIELDS = (
     _field("node_rest_position", "m", "n_node 3", "first", "undeformed position"),
     _field("node_mass", "kg", "n_node", "own", "lumped mass"),
@@ -76,22 +76,23 @@ MODEL_FIELDS = (
     _field("spring_stiffness", "N/m", "n_spring", "own", "k"),
     _field("spring_rest_length", "m", "n_spring", "rest", "l0"),
     _field("stiffens", "", "", "shared", "True if any spring stiffens with strain", "bool"),
-    _field("node_softness", "1/J", "n_soft", "own", "5 / sum of k l0^2 over the springs of a node"),
+    _field("node_softness", "1/J", "n_soft", "own", "1 / (2 E_a V_a) of its `Stiffening`"),
     _field("node_onset", "", "n_soft", "shared", "e0 of its `Stiffening`"),
     _field("node_growth", "", "n_soft", "shared", "1 / (e1 - e0)"),
     _field("node_excess", "", "n_soft", "shared", "(c - 1) (e1 - e0)"),
+    _field("spring_hold", "N/m", "n_steep", "own", "implicit stiffness of a spring over its steepness"),
     _field("steep_rise", "", "", "shared", "least rise of a spring with a steepness of STEEP_EXCESS"),
     _field("steep_sweeps", "", "", "shared", "most sweeps of `hold_steep`", "int64"),
-    _field("relaxes", "", "", "shared", "True if any spring has Maxwell arms", "bool"),
-    _field("spring_gain", "", "n_relaxing", "shared", "immediate tension over that at equilibrium, 1 + sum g_i"),
-    _field("spring_arm_modulus", "", "n_arm", "shared", "g_i, arm by arm"),
-    _field("arm_time", "s", "3", "shared", "tau_i of all springs, inf for an unused arm"),
+    _field("relaxes", "", "", "shared", "True if any element has Maxwell arms", "bool"),
+    _field("element_gain", "", "n_relaxing", "shared", "immediate tension over that at equilibrium, 1 + sum g_i"),
+    _field("element_arm_modulus", "", "n_arm", "shared", "g_i, arm by arm"),
+    _field("arm_time", "s", "3", "shared", "tau_i of all elements, inf for an unused arm"),
     _field("tet_nodes", "", "n_tet 4", "shared", "corners of each tet", "int32"),
-    _field("tet_rest_volume", "m^3", "n_tet", "alone", "V0"),
+    _field("tet_rest_volume", "m^3", "n_tet", "rest", "V0"),
     _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
     _field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
     _field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
-    _field("node_rest_volume", "m^3", "n_node", "alone", "volume averaged at a node, a quarter of its tets"),
+    _field("node_rest_volume", "m^3", "n_node", "rest", "volume averaged at a node, a quarter of its tets"),
     _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
     _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
     _field("averages_volume", "", "", "own", "True if any node_bulk is above 0", "bool"),
@@ -126,8 +127,8 @@ KEPT_FIELDS = (
     _field("node_position", "m", "n_node 3", "own", ""),
     _field("node_velocity", "m/s", "n_node 3", "own", ""),
     _field("node_force", "N", "n_node 3", "own", "force of the last substep, without anchors' reactions"),
-    _field("spring_arm_tension", "N/m", "n_arm", "own", "relaxed tension over l0 of each arm, arm by arm"),
-    _field("spring_relief", "N/m", "n_relaxing", "own", "sum_i g_i times that"),
+    _field("element_arm_tension", "N/m, Pa", "n_arm", "own", "relaxed tension of each arm, of springs over l0"),
+    _field("element_relief", "N/m, Pa", "n_relaxing", "own", "sum_i g_i times that"),
     _field("contact_engaged", "", "n_shape n_point", "rows", "1 for a point in contact with a shape", "uint8"),
     _field("contact_stretch", "m", "n_shape n_point 3", "rows", "tangential stretch of static friction"),
     _field("contact_passed", "", "2", "rows", "shape and triangle passed through, after such a fault", "int32"),
@@ -184,11 +185,12 @@ class OrganModel(NamedTuple):
     node_onset: FloatArray
     node_growth: FloatArray
     node_excess: FloatArray
+    spring_hold: FloatArray
     steep_rise: float
     steep_sweeps: int
     relaxes: bool
-    spring_gain: FloatArray
-    spring_arm_modulus: FloatArray
+    element_gain: FloatArray
+    element_arm_modulus: FloatArray
     arm_time: FloatArray
     tet_nodes: NDArray[np.int32]
     tet_rest_volume: FloatArray
@@ -246,8 +248,8 @@ class OrganState(NamedTuple):
     node_position: FloatArray
     node_velocity: FloatArray
     node_force: FloatArray
-    spring_arm_tension: FloatArray
-    spring_relief: FloatArray
+    element_arm_tension: FloatArray
+    element_relief: FloatArray
     contact_engaged: NDArray[np.uint8]
     contact_stretch: FloatArray
     contact_passed: NDArray[np.int32]

@@ -21,7 +21,7 @@ from msdm_core.kernels.contact_kernels import (
 from msdm_core.kernels.element_kernels import faded_share
 from msdm_core.kernels.guard_kernels import guard_axes
 from msdm_core.kernels.lane_view_kernels import (
-    SpringLaw,
+    TissueLaw,
     column_of,
     entry_of,
     ground_of,
@@ -159,14 +159,15 @@ def _evaluate(model, state, fades, fade_duration):
         state.node_tension[:] = 0.0
     if averages or stiffens:
         sum_at_nodes(lanes, model, state)
-    if averages and beta > 0.0:
-        add_volume_rates(lanes, model, state)
+    law = TissueLaw(stiffens, steepens, fades, fade)
     if stiffens:
         add_energies(lanes, model, state)
-        stiffens, steepens = set_node_laws(lanes, model, state)
+        stiffens, steepens = set_node_laws(lanes, model, state, law)
+        law = TissueLaw(stiffens, steepens, fades, fade)
     elif averages:
-        set_node_tension(lanes, state.node_tension, model.node_inverse_volume, model.node_bulk)
-    law = SpringLaw(stiffens, steepens, fades, fade)
+        set_node_tension(lanes, model, state, law)
+    if averages and beta > 0.0:
+        add_volume_rates(lanes, model, state)
     set_gravity(lanes, model, state)
     steep_count = add_spring_forces(lanes, model, state, law)
     if beta > 0.0:

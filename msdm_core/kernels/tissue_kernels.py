@@ -11,8 +11,8 @@ from numba import njit
 from msdm_core.kernels.element_kernels import (
     SQUEEZED_RATIO,
     STEEP_EXCESS,
+    averaged_change,
     node_law,
-    node_tension,
     six_rates,
     spring_drag,
     spring_energy,
@@ -21,6 +21,7 @@ from msdm_core.kernels.element_kernels import (
     strain_square,
     tet_scale,
     tet_shape,
+    volume_energy,
     volume_ratio,
 )
 from msdm_core.kernels.group_kernels import (
@@ -35,9 +36,9 @@ from msdm_core.kernels.layout_kernels import (
     add_half,
     add_to_corners,
     add_to_node,
-    add_volume_and_energy,
+    add_volume_and_energies,
     corner_mean,
-    corner_mean_of_pairs,
+    corner_sum_of_pairs,
     difference,
     group_width,
     load_half,
@@ -160,25 +161,29 @@ def add_energies(lanes, model, state):
 
 
 @njit(**INNER)
-def set_node_laws(lanes, model, state):
+def set_node_laws(lanes, model, state, law):
     """Tension of the averaged volumes and `node_law`, from the sums of volumes and energies around nodes.
 
-    Pairs hold the sums of six times the volumes [m^3] and of k (l - l0)^2 [J] before, tension [Pa] and half the factor
-    on springs after. One loop for both, as the root and the quotient of the law take longer than all else of a node.
+    Pairs hold the sums of six times the volumes [m^3] and of four times the node's shares of the energies of linear
+    springs and tets [J] before, tension [Pa] and half the factor on linear tensions after. One loop for both, as the
+    root and the quotient of the law take longer than all else of a node.
 
     Returns True if any factor differs from 1, and True if any steepness is above STEEP_EXCESS.
     """
-    pairs, steepness, inverse_volume, bulk = (
-        state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_bulk
+    pairs, steepness, inverse_volume, volume, bulk = (
+        state.node_pairs, state.node_steepness, model.node_inverse_volume, model.node_rest_volume, model.node_bulk
     )  # fmt: skip
+    elements = model.spring_nodes.shape[0] + model.tet_nodes.shape[0]
     softness, onset, growth, excess = model.node_softness, model.node_onset, model.node_growth, model.node_excess
     first, stiffens, steepens = 0, False, False
     if len(lanes) == 0:
-        first, stiffens, steepens = set_node_law_groups(model, state)
+        first, stiffens, steepens = set_node_law_groups(model, state, law)
     for node in range(first, steepness.shape[0]):
         six, energy = load_half(lanes, pairs, node, 0), load_half(lanes, pairs, node, 1)
-        tension = node_tension(six, load_shared(lanes, pairs, inverse_volume, node), load_item(lanes, bulk, node))
-        square = strain_square(energy, load_item(lanes, softness, node))
+        change = averaged_change(six, load_shared(lanes, pairs, inverse_volume, node))
+        rigidity = load_item(lanes, bulk, node)
+        energy = energy + 2.0 * volume_energy(change, rigidity, load_shared(lanes, pairs, volume, node))
+        tension, square = rigidity * change, strain_square(energy, load_item(lanes, softness, node))
         begin = load_shared(lanes, pairs, onset, node)
         steeper = square * 0.0
         half = steeper + 0.5
@@ -187,8 +192,11 @@ def set_node_laws(lanes, model, state):
                 square, begin, load_shared(lanes, pairs, growth, node), load_shared(lanes, pairs, excess, node)
             )
             stiffens = True
+            tension = tension * (half + half)
             if any_below(STEEP_EXCESS - steeper, 0.0):
                 steepens = True
+        if model.relaxes:
+            tension = relaxed(lanes, model, state, law, elements + node, tension, 1.0)
         store_half(lanes, pairs, node, 0, tension)
         store_half(lanes, pairs, node, 1, half)
         store_item(lanes, steepness, node, steeper)
@@ -197,7 +205,7 @@ def set_node_laws(lanes, model, state):
 
 @njit(**INLINED)
 def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
-    """Relax one arm towards the elastic tension over l0 of its spring [N/m]; returns its relief."""
+    """Relax one arm towards the elastic tension of its element; returns its relief."""
     before = load_item(lanes, arm_tension, arm)
     after = before + (elastic - before) * fade
     store_item(lanes, arm_tension, arm, where_moving(lanes, moving, after, before))
@@ -205,20 +213,20 @@ def _give_way(lanes, arm_tension, arm, elastic, fade, moving):
 
 
 @njit(**INLINED)
-def fade_arms(lanes, model, state, spring, elastic, fade):
-    """Relax the Maxwell arms of a spring towards its elastic tension: z_i <- z_i + fade_i (T_e - z_i).
+def fade_arms(lanes, model, state, element, elastic, fade):
+    """Relax the Maxwell arms of an element towards its elastic tension: z_i <- z_i + fade_i (T_e - z_i).
 
-    The arm's own tension is g_i (T_e - z_i); all tensions are over l0. At a constant strain z_i approaches T_e as
-    1 - exp(-t / tau_i), and the energy stored in an arm never rises by its relaxation.
+    The arm's own tension is g_i (T_e - z_i). At a constant strain z_i approaches T_e as 1 - exp(-t / tau_i), and the
+    energy stored in an arm never rises by its relaxation.
 
-    In:  elastic T_e / l0 [N/m], fade: share for each arm
-    Out: spring_arm_tension z_i / l0, spring_relief
+    In:  elastic T_e: of a spring over l0 [N/m], of a volume [Pa], fade: share for each arm
+    Out: element_arm_tension z_i, element_relief
     """
-    arm_modulus, arm_tension, relief = model.spring_arm_modulus, state.spring_arm_tension, state.spring_relief
-    moving, springs = state.moving, model.spring_nodes.shape[0]
-    second, third = springs + spring, 2 * springs + spring
-    total = load_shared(lanes, arm_tension, arm_modulus, spring) * _give_way(
-        lanes, arm_tension, spring, elastic, fade[0], moving
+    arm_modulus, arm_tension, relief = model.element_arm_modulus, state.element_arm_tension, state.element_relief
+    moving, count = state.moving, model.element_gain.shape[0]
+    second, third = count + element, 2 * count + element
+    total = load_shared(lanes, arm_tension, arm_modulus, element) * _give_way(
+        lanes, arm_tension, element, elastic, fade[0], moving
     )
     total = total + load_shared(lanes, arm_tension, arm_modulus, second) * _give_way(
         lanes, arm_tension, second, elastic, fade[1], moving
@@ -226,12 +234,26 @@ def fade_arms(lanes, model, state, spring, elastic, fade):
     total = total + load_shared(lanes, arm_tension, arm_modulus, third) * _give_way(
         lanes, arm_tension, third, elastic, fade[2], moving
     )
-    store_item(lanes, relief, spring, where_moving(lanes, moving, total, load_item(lanes, relief, spring)))
+    store_item(lanes, relief, element, where_moving(lanes, moving, total, load_item(lanes, relief, element)))
+
+
+@njit(**INLINED)
+def relaxed(lanes, model, state, law, element, tension, share):
+    """Tension of an element with its Maxwell arms, which relax if `law.fades`: (1 + sum g_i) T_e - sum_i g_i z_i.
+
+    Elements are the springs, then the tets, then the averaged volumes.
+
+    In: tension T_e: of a spring over its length [N/m], of a volume [Pa], share: l0 / l of a spring, 1 of a volume
+    """
+    if law.fades:
+        fade_arms(lanes, model, state, element, tension / share, law.fade)
+    gain = load_shared(lanes, state.element_relief, model.element_gain, element)
+    return tension * gain - load_item(lanes, state.element_relief, element) * share
 
 
 @njit(**INNER)
 def add_spring_forces(lanes, model, state, law):
-    """Springs without a tet: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their `SpringLaw`.
+    """Springs without a tet: f = k (l - l0) along the spring (Sala 2011, eq. 1), and their `TissueLaw`.
 
     The arms relax, and `steep_springs` gets the first of each `group_width` springs with a steep spring. Returns the
     number of its entries.
@@ -263,12 +285,7 @@ def add_spring_forces(lanes, model, state, law):
                     steep[steep_count] = entry
                     steep_count += 1
         if model.relaxes:
-            if law.fades:
-                fade_arms(lanes, model, state, spring, scale / share, law.fade)
-            gain, relief = (
-                load_shared(lanes, position, model.spring_gain, spring), load_item(lanes, state.spring_relief, spring)
-            )  # fmt: skip
-            scale = scale * gain - relief * share
+            scale = relaxed(lanes, model, state, law, spring, scale, share)
         _pull_ends(lanes, force, nodes, spring, times(scale, along))
     return steep_count
 
@@ -288,11 +305,12 @@ def add_spring_damping(lanes, model, state):
 def sum_at_nodes(lanes, model, state):
     """Sums of six times the volume of each tet [m^3] at its corners, in node_tension.
 
-    Where springs stiffen, in node_pairs with twice its spring's energy [J], as of `add_energies`.
+    Where springs stiffen, in node_pairs with four times the shares of the tet's own energy and its spring's [J].
     """
     position, _, _ = nodes_of(lanes, state)
     total, pairs, lengths, tets = state.node_tension, state.node_pairs, state.spring_lengths, model.tet_nodes
     stiffness, rest_length, stiffens = model.spring_stiffness, model.spring_rest_length, model.stiffens
+    bulk, volume, inverse_volume = model.tet_bulk, model.tet_rest_volume, model.tet_inverse_volume
     first = 0
     if len(lanes) == 0:
         first = sum_tet_groups(model, state)
@@ -301,27 +319,30 @@ def sum_at_nodes(lanes, model, state):
         _, six = tet_shape(b, c, d)
         if stiffens:
             twice = _measure(lanes, position, lengths, tet, stiffness, rest_length, b)
-            add_volume_and_energy(lanes, pairs, tets, tet, six, twice)
+            change = volume_ratio(six, load_shared(lanes, position, inverse_volume, tet)) - 1.0
+            all_four = 0.5 * volume_energy(
+                change, load_item(lanes, bulk, tet), load_shared(lanes, position, volume, tet)
+            )
+            add_volume_and_energies(lanes, pairs, tets, tet, six, twice + all_four, all_four)
         else:
             add_to_corners(lanes, total, tets, tet, six)
 
 
-@njit(**KERNEL)
-def set_node_tension(lanes, tension, node_inverse_volume, node_bulk):
-    """Tension of the averaged volumes, from the sums of six times the volumes around nodes.
-
-    In:  node_inverse_volume [1/m^3], node_bulk [Pa] (n_node,)
-    Out: tension: the sums before [m^3], [Pa] after (n_node,)
-    """
-    for node in range(tension.shape[0]):
-        inverse = load_shared(lanes, tension, node_inverse_volume, node)
-        bulk = load_item(lanes, node_bulk, node)
-        store_item(lanes, tension, node, node_tension(load_item(lanes, tension, node), inverse, bulk))
+@njit(**INNER)
+def set_node_tension(lanes, model, state, law):
+    """Tension of the averaged volumes, from the sums of six times the volumes around nodes, in node_tension."""
+    total, elements = state.node_tension, model.spring_nodes.shape[0] + model.tet_nodes.shape[0]
+    for node in range(total.shape[0]):
+        inverse = load_shared(lanes, total, model.node_inverse_volume, node)
+        tension = load_item(lanes, model.node_bulk, node) * averaged_change(load_item(lanes, total, node), inverse)
+        if model.relaxes:
+            tension = relaxed(lanes, model, state, law, elements + node, tension, 1.0)
+        store_item(lanes, total, node, tension)
 
 
 @njit(**INNER)
 def add_volume_rates(lanes, model, state):
-    """Beta's share of the averaged volume term: beta times rates of volumes, added to the sums of `sum_at_nodes`."""
+    """Beta's share of the averaged volume term, added to the tensions: K_a beta dJ_a/dt."""
     position, velocity, _ = nodes_of(lanes, state)
     total, pairs, tets, beta, stiffens = (
         state.node_tension, state.node_pairs, model.tet_nodes, model.beta, model.stiffens
@@ -329,11 +350,14 @@ def add_volume_rates(lanes, model, state):
     for tet in range(tets.shape[0]):
         b, c, d = three_edges(lanes, position, tets, tet)
         six = beta * six_rates(b, c, d, *three_edges(lanes, velocity, tets, tet))
-        if stiffens:
-            for corner in range(4):
-                add_half(lanes, pairs, tets[tet, corner], 0, six)
-        else:
-            add_to_corners(lanes, total, tets, tet, six)
+        for corner in range(4):
+            node = tets[tet, corner]
+            inverse = load_shared(lanes, position, model.node_inverse_volume, node)
+            tension = load_item(lanes, model.node_bulk, node) * (six * (inverse * (1.0 / 24.0)))
+            if stiffens:
+                add_half(lanes, pairs, node, 0, tension)
+            else:
+                store_item(lanes, total, node, load_item(lanes, total, node) + tension)
 
 
 @njit(**INLINED)
@@ -366,7 +390,7 @@ def add_tet_forces(lanes, model, state, law, steep_count):
     stiffness, rest_length = model.spring_stiffness, model.spring_rest_length
     low, squeezed = state.volume_ratio_smallest, state.squeezed_tets
     pairs, lengths = state.node_pairs, state.spring_lengths
-    steep, steep_sum = state.steep_springs, 1.0 + model.steep_rise
+    steep, steep_sum, springs = state.steep_springs, 1.0 + model.steep_rise, model.spring_nodes.shape[0]
     first, count = 0, 0
     if len(lanes) == 0:
         first, count, steep_count = add_tet_groups(model, state, law, steep_count)
@@ -383,30 +407,26 @@ def add_tet_forces(lanes, model, state, law, steep_count):
                 squeezed[count] = entry
                 count += 1
         if model.stiffens:
-            averaged = corner_mean_of_pairs(lanes, pairs, tets, tet)
+            averaged = 0.25 * corner_sum_of_pairs(lanes, pairs, tets, tet, 0)
             length = _kept_length(lanes, lengths, tet, b)
         else:
             averaged, length = corner_mean(lanes, tension, tets, tet), spring_length(b)
-        bulk, averaged_bulk = load_item(lanes, model.tet_bulk, tet), load_item(lanes, model.tet_averaged_bulk, tet)
-        scale = tet_scale(ratio, bulk, averaged_bulk, averaged)
+        own = load_item(lanes, model.tet_bulk, tet) * (ratio - 1.0)
         share = load_shared(lanes, position, rest_length, tet) / length
         rigidity = load_item(lanes, stiffness, tet)
         pull = spring_scale(share, rigidity)
         if law.stiffens:
             factor = _end_sum(lanes, pairs, tets, tet)
-            pull = pull * factor
+            pull, own = pull * factor, own * (0.5 * corner_sum_of_pairs(lanes, pairs, tets, tet, 1))
             if law.steepens and any_below(factor * -1.0, -steep_sum):
                 entry = tet // width * width
                 if steep_count == 0 or steep[steep_count - 1] != entry:
                     steep[steep_count] = entry
                     steep_count += 1
         if model.relaxes:
-            if law.fades:
-                fade_arms(lanes, model, state, tet, pull / share, law.fade)
-            gain, relief = (
-                load_shared(lanes, position, model.spring_gain, tet), load_item(lanes, state.spring_relief, tet)
-            )  # fmt: skip
-            pull = pull * gain - relief * share
+            pull = relaxed(lanes, model, state, law, tet, pull, share)
+            own = relaxed(lanes, model, state, law, springs + tet, own, 1.0)
+        scale = tet_scale(ratio, own, load_item(lanes, model.tet_averaged_bulk, tet), averaged)
         at_b = minus(times(scale, gradient), times(pull, b))
         _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b)
     store_item(lanes, low, 0, where_moving(lanes, state.moving, lowest, load_item(lanes, low, 0)))

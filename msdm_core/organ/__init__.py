@@ -4,6 +4,7 @@ from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import (
     contact_energy,
     kinetic_energy,
+    element_strains,
     node_strains,
     potential_energy,
     support_forces,
@@ -40,6 +41,7 @@ __all__ = [
     "contact_node_area",
     "describe_fault",
     "kinetic_energy",
+    "element_strains",
     "node_strains",
     "potential_energy",
     "rest_state",

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
+from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, VOLUME_HOLD
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
@@ -37,7 +38,7 @@ from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh, area_vectors
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.foundation import Foundation, foundation_fields
-from msdm_core.organ.measure import spring_tensions
+from msdm_core.organ.measure import element_strains, element_tensions
 from msdm_core.organ.motion import Motion, motion_fields
 from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.state import blank_state
@@ -110,7 +111,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     mass = lump_mass(mesh, density, scheme=spec.mass_scheme)
     order = spring_order(mesh)
     nodes, stiffness = nodes[order.springs], stiffness[order.springs]
-    spring_law = _spring_law(spec, law, spring_modulus, order.springs, stiffness)
+    tissue_law = _tissue_law(spec, law, spring_modulus, bulk, order.springs, stiffness)
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
     surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
     supports = support_fields(spec.supports, spec.support_law, mesh, surface, anchored)
@@ -122,7 +123,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         spring_nodes=nodes,
         spring_stiffness=stiffness,
         spring_rest_length=norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1),
-        **spring_law,
+        **tissue_law,
         tet_nodes=order.tet_nodes,
         tet_rest_volume=mesh.volumes,
         tet_inverse_volume=1.0 / mesh.volumes,
@@ -284,14 +285,19 @@ class _TetLaw:
         self.arm_modulus[:, members] += fraction * (moduli - self.arm_modulus[:, members])
 
 
-def _spring_law(
-    spec: OrganSpec, law: _TetLaw, spring_modulus: FloatArray, springs: NDArray[np.intp], stiffness: FloatArray
+def _tissue_law(
+    spec: OrganSpec,
+    law: _TetLaw,
+    spring_modulus: FloatArray,
+    bulk: FloatArray,
+    springs: NDArray[np.intp],
+    stiffness: FloatArray,
 ) -> dict[str, Any]:
     """Fields of an OrganModel for stiffening and relaxation, springs in the kernels' order with their stiffness [N/m].
 
-    A node stiffens by the mean of its tets, weighted by volume and modulus; a spring relaxes by the mean of its tets,
-    weighted by their shares of its stiffness. Organs side by side share these fields: an amount equal in all tets has
-    the same bits at all nodes and springs, independent of the moduli.
+    A node stiffens, and its averaged volume relaxes, by the mean of its tets, weighted by volume and modulus; a spring
+    relaxes by the mean of its tets, weighted by their shares of its stiffness. Organs side by side share these fields
+    but node_softness: an amount equal in all tets has the same bits everywhere, independent of the moduli.
     """
     mesh = spec.mesh
 
@@ -312,12 +318,15 @@ def _spring_law(
         return first + np.divide(difference, total, out=np.zeros_like(total), where=total > 0.0)
 
     empty = np.zeros(0)
-    fields: dict[str, Any] = dict.fromkeys(("node_softness", "node_onset", "node_growth", "node_excess"), empty)
-    fields |= {"spring_gain": empty, "spring_arm_modulus": empty, "arm_time": _arm_times(spec)}
+    fields: dict[str, Any] = dict.fromkeys(
+        ("node_softness", "node_onset", "node_growth", "node_excess", "spring_hold"), empty
+    )
+    fields |= {"element_gain": empty, "element_arm_modulus": empty, "arm_time": _arm_times(spec)}
     fields |= {"steep_sweeps": steep_sweeps(1.0 + float(law.rise.max())), "steep_rise": math.inf}
     fields["stiffens"], fields["relaxes"] = bool(law.rise.any()), bool(law.arm_modulus.any())
+    weight, shear = mesh.volumes * spring_modulus, 0.4 * spring_modulus
     if fields["stiffens"]:
-        rises, weight = law.rise > 0.0, mesh.volumes * spring_modulus
+        rises = law.rise > 0.0
         onset, width = (
             node_mean(np.divide(amount, law.rise, out=np.zeros_like(amount), where=rises), law.rise * weight)
             for amount in (law.onset, law.width)
@@ -326,15 +335,22 @@ def _spring_law(
         nodes = mesh.edges[springs]
         length = norm(mesh.points[nodes[:, 0]] - mesh.points[nodes[:, 1]], axis=1)
         sums = np.bincount(nodes.ravel(), np.repeat(stiffness * (length * length), 2), mesh.node_count)
-        fields["node_softness"] = 5.0 / sums
+        # Young's modulus over that of springs alone, E / (3 mu).
+        share = (5.0 * shear + 3.0 * bulk) / (3.0 * (2.0 * shear + bulk))
+        fields["node_softness"] = 5.0 / (sums * node_mean(share, weight))
         fields["node_onset"] = onset
         fields["node_growth"] = 1.0 / width
         fields["node_excess"] = rise * width
         fields["steep_rise"] = _steep_rise(onset, width, rise, nodes)
     if fields["relaxes"]:
-        moduli = np.stack([spring_mean(arm) for arm in law.arm_modulus])
-        fields["spring_gain"] = 1.0 + moduli.sum(axis=0)
-        fields["spring_arm_modulus"] = moduli.ravel()
+        moduli = np.stack(
+            [np.concatenate([spring_mean(arm), arm, node_mean(arm, weight)]) for arm in law.arm_modulus]
+        )
+        fields["element_gain"] = 1.0 + moduli.sum(axis=0)
+        fields["element_arm_modulus"] = moduli.ravel()
+    if fields["stiffens"]:
+        hold = stiffness * spring_mean(STEEP_HOLD * (1.0 + VOLUME_HOLD * bulk / shear))
+        fields["spring_hold"] = hold * fields["element_gain"][: len(hold)] if fields["relaxes"] else hold
     return fields
 
 
@@ -372,13 +388,12 @@ def _arm_times(spec: OrganSpec) -> FloatArray:
 
 
 def relax_arms(model: OrganModel, state: OrganState) -> None:
-    """Relax the Maxwell arms of all springs fully at the present positions, in place."""
+    """Relax all Maxwell arms fully at the present positions, in place."""
     if not model.relaxes:
         return
-    ends = state.node_position[model.spring_nodes]
-    tension = spring_tensions(model, norm(ends[:, 1] - ends[:, 0], axis=1)) / model.spring_rest_length
-    state.spring_arm_tension[:] = np.tile(tension, ARM_COUNT)
-    state.spring_relief[:] = (model.spring_arm_modulus.reshape(ARM_COUNT, -1) * tension).sum(axis=0)
+    tension = element_tensions(model, element_strains(model, state.node_position))
+    state.element_arm_tension[:] = np.tile(tension, ARM_COUNT)
+    state.element_relief[:] = (model.element_arm_modulus.reshape(ARM_COUNT, -1) * tension).sum(axis=0)
 
 
 def _tet_properties(spec: OrganSpec) -> tuple[FloatArray, FloatArray, FloatArray, _TetLaw]:

@@ -28,50 +28,86 @@ def kinetic_energy(model: OrganModel, state: OrganState) -> float:
 def potential_energy(model: OrganModel, state: OrganState) -> float:
     """Energy of springs, volume term, foundations and gravity, zero at the undeformed position [J].
 
-    U = sum_s U_s(l_s) + sum_t K_t V0_t (J_t - 1)^2 / 2 + sum_a K_a V0_a (J_a - 1)^2 / 2
-        + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) + sum_h u_h . K_h u_h / 2 - sum_i m_i g . (x_i - X_i)
-    with U_s the energy of a spring, k (l - l0)^2 / 2 if linear, without Maxwell arms; a the volumes averaged at nodes;
+    U = sum_e U_e + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) + sum_h u_h . K_h u_h / 2 - sum_i m_i g . (x_i - X_i)
+    with U_e the energy of a spring, a tet or an averaged volume without Maxwell arms (`element_energies`), if linear
+    k (l - l0)^2 / 2, K_t V0_t (J_t - 1)^2 / 2 and K_a V0_a (J_a - 1)^2 / 2;
     K'_t the averaged share of the modulus, its sum over tets below s = SQUEEZED_RATIO (infinite for a tet inside out);
     u_h the displacement of a node on an elastic foundation. Contact with tools (`contact_energy`) and supports is not
     included.
     """
-    ends = state.node_position[model.spring_nodes]
-    length = norm(ends[:, 1] - ends[:, 0], axis=1)
-    springs = float(spring_energies(model, length).sum())
+    elements = float(element_energies(model, element_strains(model, state.node_position)).sum())
     ratio = volume_ratios(model, state)
-    volume = 0.5 * float(matmul(model.tet_bulk * model.tet_rest_volume, np.square(ratio - 1.0)))
     squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_averaged_bulk > 0.0))
     share = np.maximum(ratio[squeezed], 0.0) / SQUEEZED_RATIO
     with np.errstate(divide="ignore"):
         barrier = SQUEEZED_RATIO * SQUEEZED_RATIO * ((share - 1.0) - log(share))
-    volume += float(matmul((model.tet_averaged_bulk * model.tet_rest_volume)[squeezed], barrier))
-    quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
-    averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(model.node_mass)) / model.node_rest_volume
-    volume += 0.5 * float(matmul(model.node_bulk * model.node_rest_volume, np.square(averaged - 1.0)))
+    volume = float(matmul((model.tet_averaged_bulk * model.tet_rest_volume)[squeezed], barrier))
     lift = matmul(state.node_position - model.node_rest_position, model.gravity)
     ground = (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)
     moved = state.node_position[model.foundation_nodes] - (model.foundation_position + ground)
     held = 0.5 * float((dot(model.foundation_stiffness, moved[:, None]) * moved).sum())
-    return springs + volume + held - float(matmul(model.node_mass, lift))
+    return elements + volume + held - float(matmul(model.node_mass, lift))
 
 
-def spring_tensions(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Tension of each spring at lengths [m] (n_spring,), without Maxwell arms [N], (n_spring,)."""
-    tension = model.spring_stiffness * (length - model.spring_rest_length)
+def element_strains(model: OrganModel, position: FloatArray) -> FloatArray:
+    """Strain of each spring, l / l0 - 1, of each tet, J - 1, and of the volume averaged at each node, J_a - 1.
+
+    Springs, tets and averaged volumes are the elements that `Stiffening` and `Relaxation` apply to, (n_element,).
+
+    Args:
+        position: of the nodes [m], (n_node, 3).
+    """
+    ends = position[model.spring_nodes]
+    ratio = np.empty(len(model.tet_nodes))
+    fill_volume_ratios(position, model.tet_nodes, model.tet_rest_volume, ratio)
+    quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
+    averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(position)) / model.node_rest_volume
+    length = norm(ends[:, 1] - ends[:, 0], axis=1)
+    return np.concatenate([length / model.spring_rest_length, ratio, averaged]) - 1.0
+
+
+def element_stiffness(model: OrganModel) -> FloatArray:
+    """Tension over strain of each linear element, k l0 of a spring [N/m], K of a volume [Pa], (n_element,).
+
+    Tension of a spring is over l0, as of its Maxwell arms.
+    """
+    return np.concatenate([model.spring_stiffness, model.tet_bulk, model.node_bulk])
+
+
+def element_size(model: OrganModel) -> FloatArray:
+    """Twice the energy of each linear element over strain and tension: l0^2 [m^2], V0 [m^3], (n_element,)."""
+    return np.concatenate([np.square(model.spring_rest_length), model.tet_rest_volume, model.node_rest_volume])
+
+
+def node_shares(model: OrganModel, energy: FloatArray) -> FloatArray:
+    """Sum of the energies of elements (n_element,) at each node, an even share at each of an element's, (n_node,)."""
+    count, springs, tets = len(model.node_mass), len(model.spring_nodes), len(model.tet_nodes)
+    halves, quarters = np.repeat(0.5 * energy[:springs], 2), np.repeat(0.25 * energy[springs : springs + tets], 4)
+    total = np.bincount(model.spring_nodes.ravel(), halves, count)
+    return total + np.bincount(model.tet_nodes.ravel(), quarters, count) + energy[springs + tets :]
+
+
+def element_means(model: OrganModel, value: FloatArray) -> FloatArray:
+    """Mean of a value of the nodes (n_node,) at each element, (n_element,)."""
+    return np.concatenate([value[model.spring_nodes].mean(axis=1), value[model.tet_nodes].mean(axis=1), value])
+
+
+def element_tensions(model: OrganModel, strain: FloatArray) -> FloatArray:
+    """Tension of each element without Maxwell arms [N/m, Pa], from its strain, both (n_element,)."""
+    tension = element_stiffness(model) * strain
     if not model.stiffens:
         return tension
-    rise = node_rises(model, node_strains(model, length))
-    return tension * (1.0 + rise[model.spring_nodes].mean(axis=1))
+    return tension * (1.0 + element_means(model, node_rises(model, node_strains(model, strain))))
 
 
-def node_strains(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Equivalent strain of each node, s^2 = 5 sum k (l - l0)^2 / sum k l0^2 over its springs of lengths l [m]."""
-    twice = model.spring_stiffness * np.square(length - model.spring_rest_length)
-    return np.sqrt(model.node_softness * np.bincount(model.spring_nodes.ravel(), np.repeat(twice, 2)))
+def node_strains(model: OrganModel, strain: FloatArray) -> FloatArray:
+    """Equivalent strain of each node (n_node,), s^2 = 2 U_a / (E_a V_a) (`Stiffening`), from those of elements."""
+    twice = element_size(model) * element_stiffness(model) * np.square(strain)
+    return np.sqrt(2.0 * model.node_softness * node_shares(model, twice))
 
 
 def node_rises(model: OrganModel, strain: FloatArray) -> FloatArray:
-    """Relative rise of tension over linear springs at each node (`element_kernels.node_law`), (n_node,)."""
+    """Relative rise of tension over linear tissue at each node (`element_kernels.node_law`), (n_node,)."""
     beyond, ramp = _ramps(model, strain)
     return model.node_excess * ((ramp * ramp * ramp) / 3.0 + (beyond - ramp)) / np.maximum(strain, STRAIN_LEAST)
 
@@ -82,25 +118,24 @@ def _ramps(model: OrganModel, strain: FloatArray) -> tuple[FloatArray, FloatArra
     return beyond, np.minimum(beyond, 1.0)
 
 
-def spring_energies(model: OrganModel, length: FloatArray) -> FloatArray:
-    """Energy of each spring at lengths [m] (n_spring,), without Maxwell arms [J], (n_spring,).
+def element_energies(model: OrganModel, strain: FloatArray) -> FloatArray:
+    """Energy of each element without Maxwell arms [J], from its strain, both (n_element,).
 
-    Their sum is U = sum_s k (l - l0)^2 / 2 + sum_a A_a w_a(s_a), with w_a' the rise of tension over a linear spring's
-    at the strain s_a and A_a = sum k l0^2 / 10 over the springs of node a, a node's part divided among its springs as
-    k (l - l0)^2. The gradient is `spring_tensions`.
+    Their sum is U = sum_a E_a V_a w(s_a), a node's part divided among its elements as their linear energies. The
+    gradient over strain is tension times `element_size`.
     """
-    twice = model.spring_stiffness * np.square(length - model.spring_rest_length)
+    twice = element_size(model) * element_stiffness(model) * np.square(strain)
     if not model.stiffens:
         return 0.5 * twice
-    strain = node_strains(model, length)
-    beyond, ramp = _ramps(model, strain)
+    equivalent = node_strains(model, strain)
+    beyond, ramp = _ramps(model, equivalent)
     over = beyond - ramp
     added = (
         model.node_excess / model.node_growth * (ramp * ramp * ramp * ramp / 12.0 + over / 3.0 + 0.5 * (over * over))
     )
-    # A_a w_a over the sum of k (l - l0)^2, which is s^2 / softness with A = 1 / (2 softness).
-    share = 0.5 * added / np.square(np.maximum(strain, STRAIN_LEAST))
-    return twice * (0.5 + share[model.spring_nodes].sum(axis=1))
+    # The rise of w(s) over s^2 / 2.
+    rise = 2.0 * added / np.square(np.maximum(equivalent, STRAIN_LEAST))
+    return 0.5 * twice * (1.0 + element_means(model, rise))
 
 
 def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> float:

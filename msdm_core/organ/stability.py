@@ -14,6 +14,7 @@ from msdm_core.kernels.linear_kernels import multiply_stiffness
 from msdm_core.kernels.squeeze_kernels import SWEEPS_LEAST, SWEEPS_PER_TANGENT
 from msdm_core.kernels.structure_kernels import ContactLaw, OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.organ.measure import element_means, element_stiffness
 
 # Relative accuracy of the largest eigenvalue: 1 % of the step. Lanczos converges from below, so it is added back.
 EIGENVALUE_TOLERANCE = 0.02
@@ -28,16 +29,10 @@ HELD_TANGENT = SWEEPS_MOST / SWEEPS_PER_TANGENT
 ROOT_PARTS = 2**40
 
 
-def apply_stiffness(
-    model: OrganModel, displacement: FloatArray, force: FloatArray, spring_stiffness: FloatArray | None = None
-) -> None:
-    """Fill `force` with the forces K u [N] of tissue and foundations, linearised at rest, of u [m]; both (n_node, 3).
-
-    Springs have the stiffness given [N/m] (n_spring,), left out that of the model in equilibrium.
-    """
-    stiffness = model.spring_stiffness if spring_stiffness is None else spring_stiffness
+def apply_stiffness(model: OrganModel, displacement: FloatArray, force: FloatArray) -> None:
+    """Fill `force` with the forces K u [N] of tissue and foundations, linearised at rest, of u [m]; both (n_node, 3)."""
     multiply_stiffness(
-        model.node_rest_position, model.spring_nodes, stiffness, model.tet_nodes, model.tet_rest_volume,
+        model.node_rest_position, model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_rest_volume,
         model.tet_bulk, model.node_rest_volume, model.node_bulk, displacement, np.empty(len(model.node_mass)), force,
     )  # fmt: skip
     held = model.foundation_nodes
@@ -45,17 +40,23 @@ def apply_stiffness(
         force[held] += dot(model.foundation_stiffness, displacement[held][:, None])
 
 
-def explicit_stiffness(model: OrganModel) -> FloatArray:
-    """Largest explicitly integrated tangent of each spring, Maxwell arms included [N/m], shape (n_spring,).
+def explicit_tissue(model: OrganModel) -> OrganModel:
+    """The organ with its largest explicitly integrated tangents as moduli, Maxwell arms included.
 
     The rise beyond STEEP_EXCESS is integrated implicitly (`squeeze_kernels.hold_steep`), up to HELD_TANGENT times the
     tangent at rest; a larger cap c counts as c / HELD_TANGENT, so that the step is shorter by its root.
     """
-    stiffness = model.spring_stiffness
+    if not (model.stiffens or model.relaxes):
+        return model
+    springs, tets = len(model.spring_nodes), len(model.tet_nodes)
+    factor = model.element_gain if model.relaxes else np.ones(springs + tets + len(model.node_mass))
     if model.stiffens:
-        rise = (model.node_excess * model.node_growth)[model.spring_nodes].mean(axis=1)
-        stiffness = stiffness * (1.0 + np.minimum(rise, STEEP_EXCESS)) * np.maximum((1.0 + rise) / HELD_TANGENT, 1.0)
-    return stiffness * model.spring_gain if model.relaxes else stiffness
+        rise = element_means(model, model.node_excess * model.node_growth)
+        factor = factor * (1.0 + np.minimum(rise, STEEP_EXCESS))
+        factor[:springs] *= np.maximum((1.0 + rise[:springs]) / HELD_TANGENT, 1.0)
+    stiffness, bulk, node_bulk = np.split(factor * element_stiffness(model), [springs, springs + tets])
+    averaged_bulk = model.tet_averaged_bulk * factor[springs : springs + tets]
+    return model._replace(spring_stiffness=stiffness, tet_bulk=bulk, tet_averaged_bulk=averaged_bulk, node_bulk=node_bulk)
 
 
 def steep_sweeps(tangent_cap: float) -> int:
@@ -66,7 +67,7 @@ def steep_sweeps(tangent_cap: float) -> int:
 def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = None) -> float:
     """Largest angular frequency at rest, w_max = sqrt(lambda_max(M^-1 (K + diag))) [rad/s] (Lanczos, fixed start).
 
-    K has the springs' `explicit_stiffness`.
+    K is that of `explicit_tissue`.
 
     Args:
         model: the organ.
@@ -75,11 +76,11 @@ def largest_frequency(model: OrganModel, node_stiffness: FloatArray | None = Non
     shape = model.node_rest_position.shape
     scale = np.sqrt(model.node_inverse_mass)[:, None]
     held = np.zeros((shape[0], 1)) if node_stiffness is None else node_stiffness[:, None]
-    force, springs = np.empty(shape), explicit_stiffness(model)
+    force, explicit = np.empty(shape), explicit_tissue(model)
 
     def apply(vector: FloatArray) -> FloatArray:
         displacement = scale * vector.reshape(shape)
-        apply_stiffness(model, displacement, force, springs)
+        apply_stiffness(explicit, displacement, force)
         return (scale * (force + held * displacement)).ravel()
 
     count = 3 * shape[0]
@@ -319,11 +320,12 @@ def _node_stiffness(model: OrganModel) -> FloatArray:
     block = np.zeros((len(model.node_mass), 3, 3))
     span = model.node_rest_position[model.spring_nodes]
     along = (span[:, 1] - span[:, 0]) / model.spring_rest_length[:, None]
-    springs = explicit_stiffness(model)[:, None, None] * along[:, :, None] * along[:, None, :]
+    explicit = explicit_tissue(model)
+    springs = explicit.spring_stiffness[:, None, None] * along[:, :, None] * along[:, None, :]
     for end in range(2):
         np.add.at(block, model.spring_nodes[:, end], springs)
     corners = model.node_rest_position[model.tet_nodes]
-    modulus = (model.tet_bulk + model.tet_averaged_bulk) * model.tet_inverse_volume
+    modulus = (explicit.tet_bulk + explicit.tet_averaged_bulk) * model.tet_inverse_volume
     for corner in range(4):
         p, q, r = (corners[:, (corner + turn) % 4] for turn in (1, 2, 3))
         gradient = np.cross(q - p, r - p) / 6.0

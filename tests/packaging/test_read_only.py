@@ -18,8 +18,8 @@ import sys
 sys.stderr = sys.stdout
 import msdm_core
 import numpy as np
-from msdm_core.kernels.tissue_kernels import set_node_tension
-set_node_tension((), np.array([48.0]), np.ones(1), np.ones(1))
+from msdm_core.kernels.load_kernels import fill_volume_ratios
+fill_volume_ratios(np.eye(4, 3), np.array([[3, 0, 1, 2]], dtype=np.int32), np.ones(1), np.ones(1))
 """
 
 

@@ -213,9 +213,8 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
     strain = _principal_strain(squared[near])
     equivalent = 0.0
     if model.stiffens:
-        ends = state.node_position[model.spring_nodes]
-        length = norm(ends[:, 1] - ends[:, 0], axis=1)
-        equivalent = float(node_strains(model, length)[model.node_excess > 0.0].max())
+        node_strain = node_strains(model, element_strains(model, state.node_position))
+        equivalent = float(node_strain[model.node_excess > 0.0].max())
     place, most = int(pressure.argmax()), int(strain.argmax())
     return TissueLoad(float(pressure[place]), place, float(strain[most]), int(near[most]), equivalent)
 

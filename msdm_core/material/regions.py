@@ -59,6 +59,12 @@ class Material:
             )
 
     @property
+    def strain_supported(self) -> float:
+        """Largest equivalent strain up to which recorded presses support the law; infinite if not known."""
+        supported = None if self.stiffening is None else self.stiffening.strain_supported
+        return math.inf if supported is None else supported
+
+    @property
     def spring_modulus(self) -> float:
         """Modulus in formula (6) for the shear modulus E / (2 (1 + nu)): E_s = E (1.25 / (1 + nu)) [Pa].
 

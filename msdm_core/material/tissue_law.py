@@ -32,6 +32,7 @@ class Stiffening:
         onset_strain: e0, the end of linear tissue, at least 0.
         cap_strain: e1, the beginning of the constant tangent, above e0.
         tangent_cap: c, the largest tangent over that at rest, from 1 to 100.
+        strain_supported: largest s in the recorded presses that support the law, above 0; None: not known.
 
     Raises:
         OrganError: names the field, its value and its range.
@@ -40,6 +41,7 @@ class Stiffening:
     onset_strain: float
     cap_strain: float
     tangent_cap: float
+    strain_supported: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.onset_strain < 1.0:
@@ -57,6 +59,10 @@ class Stiffening:
         if not 1.0 <= self.tangent_cap <= TANGENT_CAP_LARGEST:
             raise OrganError(
                 f"stiffening: tangent_cap is {self.tangent_cap}; it must be from 1 to {TANGENT_CAP_LARGEST:g}"
+            )
+        if self.strain_supported is not None and not 0.0 < self.strain_supported <= 10.0:
+            raise OrganError(
+                f"stiffening: strain_supported is {self.strain_supported}; it must be above 0 and at most 10"
             )
 
     @property

@@ -181,16 +181,18 @@ class TissueLoad(NamedTuple):
         pressure_node: its node
         strain: largest |lambda - 1| of the principal stretches
         strain_node: its node
+        equivalent_strain: largest of the nodes that stiffen (`Stiffening`); 0 without
     """
 
     pressure: float
     pressure_node: int
     strain: float
     strain_node: int
+    equivalent_strain: float
 
 
 def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> TissueLoad:
-    """Largest contact pressure and principal strain of an organ.
+    """Largest contact pressure, principal strain and equivalent strain of an organ.
 
     p_i = sum of w A k_p g over the quadrature points around node i (`contact_energy`), over a third of the area of its
     triangles; F_i = sum V_t F_t / sum V_t over its tets, with the singular values lambda: averages over a cell.
@@ -211,7 +213,12 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
     bound = np.maximum(np.sqrt(mean + spread) - 1.0, 1.0 - np.sqrt(np.maximum(mean - spread, 0.0)))
     near = np.flatnonzero(bound >= _principal_strain(squared[[bound.argmax()]])[0] - ROUNDING)
     strain = _principal_strain(squared[near])
-    return TissueLoad(float(pressure.max()), int(pressure.argmax()), float(strain.max()), int(near[strain.argmax()]))
+    equivalent = 0.0
+    if model.stiffens:
+        node_strain = node_strains(model, element_strains(model, state.node_position))
+        equivalent = float(node_strain[model.node_excess > 0.0].max())
+    place, most = int(pressure.argmax()), int(strain.argmax())
+    return TissueLoad(float(pressure[place]), place, float(strain[most]), int(near[most]), equivalent)
 
 
 def _principal_strain(squared: FloatArray) -> FloatArray:

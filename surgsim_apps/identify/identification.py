@@ -23,6 +23,7 @@ from surgsim_apps.identify.shape_search import (
     ShapeSpace,
     find_linear,
     find_shape,
+    site_errors,
 )
 from surgsim_apps.identify.site_fit import (
     OFFSET_SHARE,
@@ -40,6 +41,9 @@ from surgsim_env.step_progress import StepProgress
 SITES_LEAST = 6
 # Poisson's ratios beside the given one.
 OTHER_RATIOS = (0.40, 0.48)
+# Least gain of a stiffening law, beyond its own noise, over the error of linear tissue: less is no better for any press
+# within the recorded ones, and a law many times too stiff beyond them.
+GAIN_LEAST = 0.1
 # Fewest held presses for relaxation, in each half.
 HELD_LEAST = 2
 
@@ -80,9 +84,8 @@ class ForceError:
     high: float
 
     @classmethod
-    def of(cls, fits: SiteFits) -> "ForceError":
-        """Error of fitted sites."""
-        errors = fits.deep_errors
+    def of(cls, errors: FloatArray) -> "ForceError":
+        """Error of samples (n_sample,)."""
         return cls(float(np.median(errors)), float(np.percentile(errors, 90.0)))
 
 
@@ -93,6 +96,8 @@ class SetResult:
     Fields:
         recording: the set
         left_out: unusable sites, by reason
+        kept_in: error with these sites kept in, the fitted half counted as the held-out half; only for reasons with
+            samples of a force above 0
         fits: modulus, offset and force of every usable site with the identified shape
         linear_fits: the same with the best linear tissue
         is_training: true for usable sites of the training half, (n_site,)
@@ -101,11 +106,38 @@ class SetResult:
 
     recording: Recording
     left_out: dict[str, list[int]]
+    kept_in: dict[str, ForceError]
     fits: SiteFits
     linear_fits: SiteFits
     is_training: np.ndarray
     error: ForceError
     linear_error: ForceError
+
+
+@dataclass(frozen=True)
+class LawGain:
+    """Mean error of the held-out sites with linear tissue and with the best law, and the gain that accepts the law.
+
+    The error of a site is its median; the gain needed is GAIN_LEAST of the linear error and STANDARD_ERRORS standard
+    errors of the gain, paired by site.
+    """
+
+    linear: float
+    law: float
+    needed: float
+
+    @classmethod
+    def of(cls, linear: SampledCurve, law: SampledCurve, samples: Sequence[SiteSamples]) -> "LawGain":
+        """Gain of a law's curve over a linear curve on sites."""
+        before, after = (site_errors([curve], samples, refine=True)[0] for curve in (linear, law))
+        noise = STANDARD_ERRORS * (before - after).std(ddof=1) / math.sqrt(len(before))
+        mean = float(before.mean())
+        return cls(mean, float(after.mean()), GAIN_LEAST * mean + float(noise))
+
+    @property
+    def is_enough(self) -> bool:
+        """True if the law is accepted."""
+        return self.linear - self.law >= self.needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +148,9 @@ class Identification:
         options: as given
         sets: one per recording
         best, linear: best shape with its intervals; best linear shape
-        is_linear: true if linear tissue describes the training sites as well: the material has no stiffening
+        gain: of the best law over linear tissue; not enough: the material has no stiffening
+        strain_supported: largest equivalent strain that the model's tissue reaches at half of the fitted sites or more;
+            0 for linear tissue
         curve, linear_curve: presses of the identified and of the linear shape
         relaxation: arms by held presses, with the relative moduli of the springs
         other_ratios: error on the training sites and factor on the modulus for other Poisson's ratios
@@ -128,13 +162,19 @@ class Identification:
     sets: tuple[SetResult, ...]
     best: ShapeFit
     linear: PressShape
-    is_linear: bool
+    gain: LawGain
+    strain_supported: float
     curve: SampledCurve
     linear_curve: SampledCurve
     relaxation: RelaxationFit | None
     other_ratios: dict[float, tuple[float, float]]
     warnings: tuple[str, ...]
     seconds: float
+
+    @property
+    def is_linear(self) -> bool:
+        """True if the material has no stiffening."""
+        return not self.gain.is_enough
 
     @property
     def shape(self) -> PressShape:
@@ -188,7 +228,7 @@ def identify(
             )
     starting = 0 if library.linear_curves else library.start_count
     has_holds = all(len(held_sites(usable)) >= 2 * HELD_LEAST for usable, _ in sorted_sets)
-    total = starting + (2 if has_holds else 1) * ROUNDS * ROUND_COUNT + len(OTHER_RATIOS)
+    total = starting + (2 if has_holds else 1) * (1 + ROUNDS * ROUND_COUNT) + len(OTHER_RATIOS)
     halves = [draw_halves(len(usable), options.seed) for usable, _ in sorted_sets]
     samples = [SiteSamples.of(usable, OFFSET_SHARE * depth_largest(usable)) for usable, _ in sorted_sets]
     relaxation = None
@@ -200,11 +240,14 @@ def identify(
         if starting:
             library.start(advance_by_one)
         while True:
-            training = [part.subset(rows) for part, (rows, _) in zip(samples, halves)]
-            linear, linear_curve = find_linear(library, training)
+            training, held_out = ([part.subset(rows[half]) for part, rows in zip(samples, halves)] for half in (0, 1))
+            linear, linear_press = find_linear(library, training, advance_by_one)
             best = find_shape(library, training, seed=options.seed, progress=advance_by_one)
-            is_linear = _is_linear(best, linear_curve, training)
-            shape, curve = (linear, linear_curve) if is_linear else (best.shape, best.curve)
+            linear_curve = library.sampled(linear_press)
+            gain = LawGain.of(linear_curve, best.curve, held_out)
+            shape, press, curve = (
+                (best.shape, best.press, best.curve) if gain.is_enough else (linear, linear_press, linear_curve)
+            )
             if not has_holds:
                 break
             is_second = relaxation is not None
@@ -217,29 +260,43 @@ def identify(
         if relaxation is not None:
             relaxation = _of_springs(library, shape, curve, relaxation)
     sets = []
-    for recording, (_, left_out), part, (trained, held_out) in zip(recordings, sorted_sets, samples, halves):
+    for recording, (_, left_out), part, others, (trained, _) in zip(recordings, sorted_sets, samples, held_out, halves):
         is_training = np.isin(np.arange(len(part)), trained)
-        others = part.subset(held_out)
-        error, linear_error = (ForceError.of(fit_sites(press, others)) for press in (curve, linear_curve))
+        errors, linear_errors = (fit_sites(area, others).deep_errors for area in (curve, linear_curve))
         sets.append(
             SetResult(
-                recording, left_out, fit_sites(curve, part), fit_sites(linear_curve, part), is_training, error,
-                linear_error,
+                recording, left_out, _kept_in(recording, left_out, curve, part.offsets, errors), fit_sites(curve, part),
+                fit_sites(linear_curve, part), is_training, ForceError.of(errors), ForceError.of(linear_errors),
             )
         )  # fmt: skip
     result = Identification(
-        options, tuple(sets), best, linear, is_linear, curve, linear_curve, relaxation, other_ratios, (),
-        time.perf_counter() - begin,
+        options, tuple(sets), best, linear, gain, _strain_supported(press, curve, training), curve, linear_curve,
+        relaxation, other_ratios, (), time.perf_counter() - begin,
     )  # fmt: skip
     return replace(result, warnings=tuple(_warnings(result, library)))
 
 
-def _is_linear(best: ShapeFit, linear_curve: SampledCurve, training: Sequence[SiteSamples]) -> bool:
-    """True if stiffening lowers the errors of the training sites by less than STANDARD_ERRORS, paired by site."""
-    gain = np.concatenate(
-        [fit_sites(linear_curve, part).site_errors - fit_sites(best.curve, part).site_errors for part in training]
-    )
-    return bool(gain.mean() <= STANDARD_ERRORS * gain.std(ddof=1) / math.sqrt(len(gain)))
+def _strain_supported(press: PressCurve, curve: SampledCurve, training: Sequence[SiteSamples]) -> float:
+    """Median over the fitted sites of the largest equivalent strain at full depth with their offsets."""
+    depths = [part.depth.max(axis=1) + fit_sites(curve, part).offset for part in training]
+    return float(np.median(np.interp(np.concatenate(depths), press.depth, press.strain)))
+
+
+def _kept_in(
+    recording: Recording,
+    left_out: dict[str, list[int]],
+    curve: SampledCurve,
+    offsets: FloatArray,
+    errors: FloatArray,
+) -> dict[str, ForceError]:
+    """Error with the unusable sites of each reason kept in, from the errors of the held-out samples (n_sample,)."""
+    kept_in = {}
+    for reason, numbers in left_out.items():
+        sites = [press for press in recording.presses if press.site in numbers]
+        added = fit_sites(curve, SiteSamples.of(sites, offsets[-1])).deep_errors
+        if len(added):
+            kept_in[reason] = ForceError.of(np.concatenate([errors, errors, added]))
+    return kept_in
 
 
 def _relaxation(
@@ -323,9 +380,10 @@ def _warnings(result: Identification, library: PressLibrary) -> list[str]:
     warnings = []
     intervals = result.best.intervals
     if result.is_linear:
+        gain = result.gain
         warnings.append(
-            "stiffening is not identifiable: linear tissue describes the training sites as well; the material has no "
-            "stiffening"
+            f"the material is linear: the best law lowers the mean error of held-out sites from {gain.linear:.2%} to "
+            f"{gain.law:.2%}; a law needs a gain of {gain.needed:.2%}, a tenth of the error beyond its noise"
         )
     else:
         for name, interval in intervals.items():
@@ -353,8 +411,11 @@ def _warnings(result: Identification, library: PressLibrary) -> list[str]:
         )
     for dataset in result.sets:
         for reason, sites in dataset.left_out.items():
+            kept_in = dataset.kept_in.get(reason)
+            error = f"with them kept in, {kept_in.median:.1%}" if kept_in else "no force of theirs is above 0"
             warnings.append(
-                f"{dataset.recording.name}: {len(sites)} sites are left out, with {reason}: {_listed(sites)}"
+                f"{dataset.recording.name}, left out: {len(sites)} of {len(dataset.recording.presses)} sites "
+                f"({reason}); {error}: sites {_listed(sites)}"
             )
     if library.failed:
         warnings.append(

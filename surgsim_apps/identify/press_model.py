@@ -23,6 +23,7 @@ from msdm_core.organ import (
     rest_state,
     round_shapes,
     stable_dt,
+    tissue_load,
 )
 
 # Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], without influence on a static press.
@@ -88,11 +89,13 @@ class PressCurve:
     Fields:
         depth: [m], from 0 on, (n_knot,)
         area: force over Young's modulus [m^2], (n_knot,)
+        strain: largest equivalent strain of stiffening tissue (`TissueLoad`), (n_knot,)
         volume_ratio_smallest: of any tet at the largest depth
     """
 
     depth: FloatArray
     area: FloatArray
+    strain: FloatArray
     volume_ratio_smallest: float
 
     def at(self, depth: FloatArray) -> FloatArray:
@@ -126,7 +129,7 @@ def press_block(shape: PressShape, setting: PressSetting, *, cells_to_radius: fl
     centre = np.array([*top[:2], top[2] + setting.ball_radius])
     shapes = round_shapes([[centre, centre]], setting.ball_radius)
     knots = setting.depth * np.linspace(0.0, 1.0, KNOT_COUNT + 1) ** KNOT_POWER
-    area, wrench = np.zeros(len(knots)), np.zeros((1, 6))
+    area, strain, wrench = np.zeros(len(knots)), np.zeros(len(knots)), np.zeros((1, 6))
     for knot in range(1, len(knots)):
         speed = (knots[knot] - knots[knot - 1]) / (moving * dt)
         for count, velocity in ((moving, -speed), (holding, 0.0), (reading, 0.0)):
@@ -139,7 +142,8 @@ def press_block(shape: PressShape, setting: PressSetting, *, cells_to_radius: fl
                     "tissue or a larger ball may be nearer to what was pressed"
                 )
         area[knot] = wrench[0, 2] / MODULUS
-    return PressCurve(knots, np.maximum.accumulate(area), float(state.volume_ratio_smallest[0]))
+        strain[knot] = tissue_load(model, state, shapes, law).equivalent_strain
+    return PressCurve(knots, np.maximum.accumulate(area), strain, float(state.volume_ratio_smallest[0]))
 
 
 def _block(shape: PressShape, setting: PressSetting, cells_to_radius: float) -> tuple[OrganModel, FloatArray]:

@@ -45,7 +45,8 @@ def material_tables(result: Identification) -> dict[str, Any]:
     }
     if not result.is_linear:
         names = ("onset_strain", "cap_strain", "tangent_cap")
-        material["stiffening"] = {name: rounded(getattr(result.shape, name)) for name in names}
+        law = {name: rounded(getattr(result.shape, name)) for name in names}
+        material["stiffening"] = {**law, "strain_supported": rounded(result.strain_supported)}
     if result.relaxation is not None and result.relaxation.times:
         material["relaxation"] = {
             "relative_moduli": [rounded(modulus) for modulus in result.relaxation.relative_moduli],
@@ -99,6 +100,7 @@ def _comments(result: Identification) -> dict[str, str]:
         "density": "[kg/m^3] of soft tissue, chosen: not identifiable by presses",
         "poisson_ratio": "given, not identified",
         "times": "[s]",
+        "strain_supported": "largest strain of the model's tissue at half of the fitted sites or more",
     }
     for name, interval in result.best.intervals.items():
         doubt = "" if interval.is_identifiable else ", not identifiable"
@@ -139,12 +141,17 @@ def summary(result: Identification, command_line: str) -> dict[str, Any]:
             for name, interval in result.best.intervals.items()
         },
         "linear": {"thickness": rounded(result.linear.thickness), "is_as_good": result.is_linear},
+        "mean_error": {name: rounded(value) for name, value in vars(result.gain).items()},
         "sets": {
             dataset.recording.name: {
                 "sites": len(dataset.recording.presses),
                 "used": len(dataset.fits.samples),
                 "training": int(dataset.is_training.sum()),
                 "left_out": dataset.left_out,
+                "error_with_left_out": {
+                    reason: {"median": rounded(error.median), "high": rounded(error.high)}
+                    for reason, error in dataset.kept_in.items()
+                },
                 "modulus_median": rounded(float(np.median(dataset.fits.modulus))),
                 "offset_median": rounded(float(np.median(dataset.fits.offset))),
                 "held_out_error": {"median": rounded(dataset.error.median), "high": rounded(dataset.error.high)},
@@ -218,7 +225,8 @@ def _law_text(result: Identification) -> str:
         return "linear springs"
     shape = result.shape
     return (
-        f"onset_strain {shape.onset_strain:.3g}, cap_strain {shape.cap_strain:.3g}, tangent_cap {shape.tangent_cap:.3g}"
+        f"onset_strain {shape.onset_strain:.3g}, cap_strain {shape.cap_strain:.3g}, "
+        f"tangent_cap {shape.tangent_cap:.3g}, supported up to a strain of {result.strain_supported:.2g}"
     )
 
 

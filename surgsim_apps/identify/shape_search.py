@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
+from scipy.interpolate import PchipInterpolator, RBFInterpolator
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
@@ -22,8 +22,13 @@ from surgsim_env.coupling import core_count
 # Searched ranges: thickness in radii of the ball, onset strain, cap strain less onset strain, tangent cap.
 THICKNESS_RADII = (1.2, 4.5)
 ONSET_RANGE, WIDTH_RANGE, CAP_RANGE = (0.0, 0.2), (0.05, 0.25), (2.0, 80.0)
+# Least thickness over the largest depth of a press with a law, and of linear tissue, whose presses succeed in thinner
+# tissue: thickness is all that makes it stiffen, and the law is compared with the best.
+DEPTH_SHARE, DEPTH_SHARE_LINEAR = 1.7, 1.2
 # Presses spread over all four; over the law alone, for a given thickness; linear presses.
-SPREAD_COUNT, SPREAD_COUNT_LAW, LINEAR_COUNT = 56, 32, 6
+SPREAD_COUNT, SPREAD_COUNT_LAW, LINEAR_COUNT = 56, 32, 8
+# Thicknesses between the linear presses at which their interpolation is compared.
+LINEAR_GRID_COUNT = 61
 # Rounds of presses of the best shapes, and their number in each.
 ROUNDS, ROUND_COUNT = 3, 4
 # Least distance between the best shapes, in the unit box of shapes.
@@ -61,11 +66,11 @@ class ShapeSpace:
 
     @property
     def thickness_range(self) -> tuple[float, float]:
-        """Least and largest searched thickness [m], above the deepest press."""
+        """Least and largest searched thickness of tissue with a law [m], above the deepest press."""
         if self.thickness is not None:
             return self.thickness, self.thickness
         low, high = (radii * self.ball_radius for radii in THICKNESS_RADII)
-        least = max(low, 1.7 * self.depth)
+        least = max(low, DEPTH_SHARE * self.depth)
         return least, max(high, 1.5 * least)
 
     @property
@@ -82,8 +87,16 @@ class ShapeSpace:
         least, most = CAP_RANGE
         return PressShape(thickness, onset, onset + _between(WIDTH_RANGE, width), least * (most / least) ** cap)
 
+    @property
+    def linear_least(self) -> float:
+        """Place of the thinnest linear tissue, at most 0."""
+        low, high = self.thickness_range
+        if self.thickness is not None:
+            return 0.0
+        return min(0.0, math.log(DEPTH_SHARE_LINEAR * self.depth / low) / math.log(high / low))
+
     def linear(self, place: float) -> PressShape:
-        """Linear tissue at a place from 0 to 1 of the range of thickness."""
+        """Linear tissue at a place from `linear_least` to 1 of the range of thickness, logarithmic."""
         low, high = self.thickness_range
         return PressShape(low * (high / low) ** place)
 
@@ -118,17 +131,23 @@ class PressLibrary:
 
     def start(self, progress: Progress = lambda: None) -> None:
         """Press linear tissue of some thicknesses, and shapes spread over the whole range."""
-        places = [0.0] if self.space.thickness is not None else np.linspace(0.0, 1.0, LINEAR_COUNT).tolist()
+        places = (
+            np.linspace(self.space.linear_least, 1.0, LINEAR_COUNT).tolist() if self.space.thickness is None else [0.0]
+        )
         count = self.start_count - len(places)
         # The stubs know only `rng`, which gives other points for the same number.
         spread = qmc.Sobol(self.space.dimension, seed=1).random(64)[:count]  # pyright: ignore[reportCallIssue]
+        self.add_linear(places, progress)
+        if not self.linear_curves:
+            raise ValueError(f"no press of linear tissue succeeds: {self.failed[0]}")
+        self.add(list(spread), progress)
+
+    def add_linear(self, places: Sequence[float], progress: Progress = lambda: None) -> None:
+        """Press linear tissue at places of the range of thickness; failures are recorded."""
         for place, curve in zip(places, self.press([self.space.linear(place) for place in places], progress)):
             if curve is not None:
                 self.linear_places.append(place)
                 self.linear_curves.append(curve)
-        if not self.linear_curves:
-            raise ValueError(f"no press of linear tissue succeeds: {self.failed[0]}")
-        self.add(list(spread), progress)
 
     def add(self, points: Sequence[FloatArray], progress: Progress = lambda: None) -> None:
         """Press the shapes at points; failures are recorded."""
@@ -193,7 +212,7 @@ class ShapeFit:
     """Best shape, its run of the organ, and its intervals.
 
     Fields:
-        shape, curve: thickness and law, and its run
+        shape, press, curve: thickness and law, its run, and the run on even depths
         intervals: of each searched parameter, by its name
         training_count: number of training sites in the search
         cost: mean error of the training sites but the worst
@@ -201,6 +220,7 @@ class ShapeFit:
     """
 
     shape: PressShape
+    press: PressCurve
     curve: SampledCurve
     intervals: dict[str, Interval]
     training_count: int
@@ -214,18 +234,36 @@ def trimmed_mean(errors: FloatArray) -> FloatArray:
     return np.sort(errors, axis=-1)[..., :kept].mean(axis=-1)
 
 
-def site_errors(curves: Sequence[SampledCurve], samples: Sequence[SiteSamples]) -> FloatArray:
+def site_errors(curves: Sequence[SampledCurve], samples: Sequence[SiteSamples], *, refine: bool = False) -> FloatArray:
     """Error of each site of all sets for each curve, (n_curve, n_site)."""
     return np.array(
-        [np.concatenate([fit_sites(curve, part, refine=False).site_errors for part in samples]) for curve in curves]
+        [np.concatenate([fit_sites(curve, part, refine=refine).site_errors for part in samples]) for curve in curves]
     )
 
 
-def find_linear(library: PressLibrary, samples: Sequence[SiteSamples]) -> tuple[PressShape, SampledCurve]:
-    """Linear tissue that fits the training sites best, among the linear runs."""
-    curves = [library.sampled(curve) for curve in library.linear_curves]
-    best = int(trimmed_mean(site_errors(curves, samples)).argmin())
-    return library.space.linear(library.linear_places[best]), curves[best]
+def find_linear(
+    library: PressLibrary, samples: Sequence[SiteSamples], progress: Progress = lambda: None
+) -> tuple[PressShape, PressCurve]:
+    """Linear tissue that fits the training sites best, of the linear runs and one where their interpolation fits best.
+
+    Args:
+        library: with linear runs; the new one joins them.
+        samples: training sites of each set.
+        progress: called once.
+    """
+    grid = np.linspace(min(library.linear_places), 1.0, LINEAR_GRID_COUNT)
+    if len(library.linear_places) > 1:
+        order = np.argsort(library.linear_places)
+        roots = np.array([library.sampled(library.linear_curves[run]).root for run in order])
+        between = PchipInterpolator(np.array(library.linear_places)[order], roots)(grid)
+        curves = [SampledCurve(library.setting.depth, root) for root in between]
+        place = float(grid[trimmed_mean(site_errors(curves, samples)).argmin()])
+        if np.abs(np.array(library.linear_places) - place).min() > grid[1] - grid[0]:
+            library.add_linear([place])
+    progress()
+    costs = trimmed_mean(site_errors([library.sampled(curve) for curve in library.linear_curves], samples))
+    best = int(costs.argmin())
+    return library.space.linear(library.linear_places[best]), library.linear_curves[best]
 
 
 def find_shape(
@@ -252,6 +290,7 @@ def find_shape(
     shape = library.space.shape(library.points[best])
     return ShapeFit(
         shape=shape,
+        press=library.curves[best],
         curve=library.sampled(library.curves[best]),
         intervals=_intervals(library, parts, best, candidates),
         training_count=errors.shape[1],

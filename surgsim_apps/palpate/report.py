@@ -48,6 +48,8 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
         for fault in palpation.hold.faults:
             # Markup would take [[anchors]] for a style.
             console.print(f"not held well: {fault}", highlight=False, markup=False)
+    for line in _extrapolation(palpation):
+        console.print(line, highlight=False)
     console.print(_counts(palpation))
 
 
@@ -97,9 +99,23 @@ def _sentence(contrast_map: ContrastMap) -> str:
 
 
 def _notes(palpation: PalpationResult) -> list[str]:
-    """Reasons of misses, and faults of the organ's hold."""
+    """Reasons of misses, faults of the organ's hold, and strains beyond the law's."""
     misses = [f"{miss.lesion}, against the {miss.map_name}: {miss.text}." for miss in palpation.misses]
-    return misses + ([] if palpation.hold is None else [f"Not held well: {fault}." for fault in palpation.hold.faults])
+    faults = [] if palpation.hold is None else [f"Not held well: {fault}." for fault in palpation.hold.faults]
+    return [*misses, *faults, *(f"{line}." for line in _extrapolation(palpation))]
+
+
+def _extrapolation(palpation: PalpationResult) -> list[str]:
+    """A sentence on presses that strain the tissue beyond its law's support; empty if none does."""
+    supported = palpation.anatomy.scene.material.strain_supported
+    strains = [press.load.equivalent_strain for press in palpation.presses]
+    count = sum(strain > supported for strain in strains)
+    if not count:
+        return []
+    return [
+        f"at {count} of {len(strains)} sites the equivalent strain ({max(strains):.2f} at most) is beyond "
+        f"{supported:.2g}, up to which recorded presses support the tissue's law"
+    ]
 
 
 def _lesion_rows(palpation: PalpationResult) -> Rows:

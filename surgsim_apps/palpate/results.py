@@ -93,6 +93,8 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
         "force_peak_N": max(press.force_peak for press in palpation.presses),
         "tissue_pressure_largest_Pa": max(press.load.pressure for press in palpation.presses),
         "tissue_strain_largest": max(press.load.strain for press in palpation.presses),
+        "tissue_equivalent_strain_largest": max(press.load.equivalent_strain for press in palpation.presses),
+        "tissue_equivalent_strain_supported": scene.material.strain_supported,
         "volume_ratio_smallest": min(press.volume_ratio_smallest for press in both),
         "simulated_time_s": palpation.simulated_time,
         "wall_time_s": palpation.wall_time,

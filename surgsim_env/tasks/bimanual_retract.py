@@ -69,7 +69,8 @@ class BimanualRetractTask(RetractTask):
     That of `SurgSim/Retract-v0`, and `collided`, `touches` (bool), `uncovered` (share), `touch_force`,
     `collision_force` [N].
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, and `damaged` (bool): more than a limit is a safety stop.
+    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
+    `damaged` (bool): more than a limit is a safety stop.
 
     ## Arguments
     Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair", or two arms (names or TOML files) as "LEFT+RIGHT":

@@ -97,7 +97,8 @@ class PalpateSitesTask(Task):
     `lesion_count_estimated`, `success`, `is_success`.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, and `damaged` (bool): more than a limit is a safety stop.
+    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
+    `damaged` (bool): more than a limit is a safety stop.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "phantom".

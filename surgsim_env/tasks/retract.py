@@ -169,7 +169,8 @@ class RetractTask(Task):
     `strain_middle`, `strain_free`: largest strain of an edge of the mesh in the lobe's thirds, from the held edge to
     the free one.
     Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, and `damaged` (bool): more than a limit is a safety stop.
+    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
+    `damaged` (bool): more than a limit is a safety stop.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[retract]` table, or that names such a file, as

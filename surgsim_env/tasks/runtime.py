@@ -248,11 +248,20 @@ class TaskRuntime:
         return load.pressure > (limits.pressure or math.inf) or load.strain > (limits.strain or math.inf)
 
     def _tissue_info(self, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
-        """Largest pressure [Pa] and strain of the tissue, for scenes with limits of these; 0 without a load."""
+        """Largest pressure [Pa] and strain of the tissue, for scenes with limits of these; 0 without a load.
+
+        It is extrapolated beyond the equivalent strain up to which recorded presses support the tissue's law.
+        """
         if not self.task.limits.judges_tissue:
             return {}
-        pressure, strain = (0.0, 0.0) if load is None else (load.pressure, load.strain)
-        return {"tissue_pressure": pressure, "tissue_strain": strain, "damaged": end == DAMAGE}
+        pressure, strain, equivalent = (
+            (0.0, 0.0, 0.0) if load is None else (load.pressure, load.strain, load.equivalent_strain)
+        )
+        extrapolated = equivalent > self.task.anatomy.scene.material.strain_supported
+        return {
+            "tissue_pressure": pressure, "tissue_strain": strain, "tissue_extrapolated": extrapolated,
+            "damaged": end == DAMAGE,
+        }  # fmt: skip
 
     # ---- saved states ------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from msdm_core.material import Stiffening
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.save import as_toml
 
@@ -39,6 +40,22 @@ def test_an_infinite_limit_measures_only(tmp_path):
     strains = [info["tissue_strain"] for _, info in infos]
     pressures = [info["tissue_pressure"] for _, info in infos]
     assert strains[0] < 0.01 < 0.1 < max(strains) and max(pressures) > 1000.0
+
+
+def test_a_strain_beyond_the_law_is_extrapolated(tmp_path):
+    """The flag follows the scene's bound, and is never set where the material has none."""
+    scene = make_scene("phantom_small")
+    law = Stiffening(0.1, 0.3, 2.0, strain_supported=0.12)
+    path = tmp_path / "supported.toml"
+    limits, material = replace(scene.limits, strain=np.inf), replace(scene.material, stiffening=law)
+    path.write_text(as_toml(replace(scene, limits=limits, material=material)))
+    infos = [info for _, info in pressed(gym.make("SurgSim/Palpate-v0", scene=str(path)))]
+    flags = [info["tissue_extrapolated"] for info in infos]
+    # Tissue is softest to shear: its equivalent strain is within a fifth of the principal strain.
+    assert all(flag for flag, info in zip(flags, infos) if info["tissue_strain"] > 1.2 * 0.12)
+    assert not any(flag for flag, info in zip(flags, infos) if info["tissue_strain"] < 0.12 / 1.2)
+    assert {*flags} == {False, True}
+    assert not any(info["tissue_extrapolated"] for _, info in pressed(made(tmp_path, strain=np.inf)))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def closed_area(depth, shape):
 def closed_press(shape, setting):
     """In place of `press_block`."""
     depth = np.linspace(0.0, setting.depth, 40)
-    return PressCurve(depth, closed_area(depth, shape), 0.6)
+    return PressCurve(depth, closed_area(depth, shape), depth / 0.01, 0.6)
 
 
 def truth(count=24, seed=0, offset=1e-3):

@@ -16,6 +16,7 @@ from surgsim_apps.identify.press_model import PressShape
 from surgsim_apps.identify.recordings import Recording, SitePress
 from surgsim_apps.identify.relaxation import Arms
 from surgsim_apps.identify.results import COLUMNS, RESULT_NAMES
+from surgsim_apps.identify.site_fit import fit_sites
 from surgsim_env.scene.load import scene_from_table, scenes_folder
 from tests.identify.made import closed_area, closed_press, recording, truth, write_csv
 from tests.identify.test_relaxation import TIME
@@ -72,8 +73,53 @@ def test_the_interval_holds_the_truth_and_a_parameter_that_is_not_identifiable_i
 def test_linear_tissue_gets_no_stiffening():
     result = identify([recording(silicone, noise=0.01)], KNOWN)
     assert result.is_linear and result.shape.tangent_cap == 1.0
-    assert any("stiffening is not identifiable" in line for line in result.warnings)
+    assert any("the material is linear" in line for line in result.warnings)
     assert result.sets[0].error == result.sets[0].linear_error
+
+
+def test_a_law_that_gains_less_than_a_tenth_of_the_error_is_not_taken():
+    """The gain is beyond its own noise, 1.645 standard errors over 192 sites, and irrelevant."""
+    weak = PressShape(0.012, 0.08, 0.2, 1.5)
+    made = recording(lambda depth: closed_area(depth, weak), count=384, noise=0.02)
+    result = identify([made], KNOWN)
+    assert result.is_linear and result.shape.tangent_cap == 1.0
+    (dataset,) = result.sets
+    others = dataset.fits.samples.subset(np.flatnonzero(~dataset.is_training))
+    linear, law = (fit_sites(curve, others).site_errors for curve in (result.linear_curve, result.best.curve))
+    noise = 1.645 * (linear - law).std(ddof=1) / np.sqrt(192)
+    assert result.gain.linear == pytest.approx(linear.mean()) and result.gain.law == pytest.approx(law.mean())
+    assert noise < result.gain.linear - result.gain.law < result.gain.needed
+    assert result.gain.needed == pytest.approx(noise + 0.1 * linear.mean())
+
+
+def test_the_law_is_supported_up_to_the_strain_of_the_deepest_presses(stiffening_set):
+    """The stand-in's strain is depth / 10 mm: (3 mm + offset) / 10 mm at half of the fitted sites."""
+    result = identify([stiffening_set], KNOWN)
+    offsets = truth()[1][result.sets[0].is_training]
+    # The law that is found differs from the true one, and its offsets by a few hundredths of a millimetre.
+    assert result.strain_supported == pytest.approx(np.median(3e-3 + offsets) / 0.01, rel=0.03)
+
+
+def test_sites_left_out_count_with_their_error(stiffening_set):
+    """As many sites of constant force as usable ones: of E A(d + o), with the best E and o, their error is known."""
+    depth = stiffening_set.presses[0].depth
+    flat = tuple(SitePress(100 + row, np.zeros(3), depth, np.full(10, 0.1)) for row in range(24))
+    result = identify([Recording("some", (*stiffening_set.presses, *flat))], KNOWN)
+    (dataset,) = result.sets
+    ((reason, sites),) = dataset.left_out.items()
+    assert sites == list(range(100, 124))
+    deep, own = depth > depth[-1] / 3.0, []
+    for offset in np.linspace(0.0, 0.5 * depth[-1], 2001):
+        area = result.curve.at(depth + offset)
+        force = (area @ np.full(10, 0.1)) / (area @ area) * area
+        own.append((((force - 0.1) ** 2).sum(), np.abs(force[deep] - 0.1) / 0.1))
+    bad = min(own, key=lambda pair: pair[0])[1]
+    held = dataset.fits.samples.subset(np.flatnonzero(~dataset.is_training))
+    good = fit_sites(result.curve, held).deep_errors
+    together = np.concatenate([good, good, *[bad] * 24])
+    assert dataset.kept_in[reason].median == pytest.approx(np.median(together), rel=1e-3)
+    assert dataset.kept_in[reason].high == pytest.approx(np.percentile(together, 90.0), rel=1e-3)
+    assert dataset.kept_in[reason].median > dataset.error.median
 
 
 def test_an_unknown_thickness_is_searched_with_a_warning(stiffening_set):
@@ -167,3 +213,4 @@ def test_the_material_fits_into_a_scene(run):
     scene = scene_from_table({**phantom, **table}, name="mine", folder=folder)
     assert scene.material.youngs_modulus == table["material"]["youngs_modulus"]
     assert scene.material.stiffening.tangent_cap == table["material"]["stiffening"]["tangent_cap"]
+    assert scene.material.strain_supported == table["material"]["stiffening"]["strain_supported"] > 0.3

@@ -41,6 +41,16 @@ def test_the_law_begins_late_and_stiffens_the_press():
     assert PressShape(0.012, 0.1, 0.2, 1.0).material(1e3, 0.45).stiffening is None
 
 
+def test_strain_rises_with_depth_and_has_no_scale(monkeypatch):
+    """All lengths twice as large, with half the pressure per penetration: the same strain at each depth."""
+    strain = coarse(LAW).strain
+    assert strain[0] == 0.0 and (np.diff(strain) > 0.0).all() and LAW.onset_strain < strain[-1] < 0.6
+    monkeypatch.setattr(press_model, "CONTACT_STIFFNESS", 0.5 * CONTACT_STIFFNESS)
+    twice = coarse(replace(LAW, thickness=0.024), PressSetting(2.0 * SETTING.ball_radius, 2.0 * SETTING.depth))
+    # But for the tolerance of the stable step's eigenvalue, and the first knots' approach to rest.
+    np.testing.assert_allclose(twice.strain, strain, rtol=2e-3, atol=1e-5)
+
+
 def test_thin_tissue_is_stiffer():
     assert (coarse(PressShape(0.008)).at(DEPTHS) > 1.1 * coarse(PressShape(0.016)).at(DEPTHS))[2:].all()
 

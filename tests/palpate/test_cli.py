@@ -2,16 +2,19 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from msdm_core.material import Stiffening
 from surgsim_apps.cli.main import main
 from surgsim_apps.palpate.results import COLUMNS
 from surgsim_env.palpation.site_press import scan
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.save import as_toml
 
 COARSE = ["palpate", "--scene", "phantom", "--spacing", "0.008"]
 
@@ -62,11 +65,26 @@ def test_summary_agrees_with_the_table(rows, summary):
     assert summary["sites"]["pressed"] == summary["sites"]["in_maps"] == len(rows)
     assert summary["force_peak_N"] >= max(float(row["force"]) for row in rows)
     assert 0.0 < summary["volume_ratio_smallest"] < 1.0
+    assert summary["tissue_equivalent_strain_supported"] is None
     assert summary["real_time_factor"] == pytest.approx(summary["simulated_time_s"] / summary["wall_time_s"], rel=1e-3)
     assert summary["simulated_time_s"] == pytest.approx(2 * len(rows) * 0.225, rel=0.01)
     assert abs(summary["model"]["modulus_factor"] - 1.0) <= 0.2
     assert summary["model"]["modulus_factor"] != 1.0
     assert set(summary["maps"]) == {"healthy neighbours", "pre-operative model"}
+
+
+def test_presses_beyond_the_strain_that_supports_the_law_are_reported(tmp_path, capsys):
+    scene = make_scene("phantom_small")
+    law = Stiffening(0.1, 0.3, 2.0, strain_supported=0.02)
+    path = tmp_path / "supported.toml"
+    path.write_text(as_toml(replace(scene, material=replace(scene.material, stiffening=law))))
+    assert main(["palpate", "--scene", str(path), "--spacing", "0.02", "--out", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    count, largest = summary["sites"]["pressed"], summary["tissue_equivalent_strain_largest"]
+    assert summary["tissue_equivalent_strain_supported"] == 0.02 < largest
+    line = f"at {count} of {count} sites the equivalent strain ({largest:.2f} at most) is beyond 0.02"
+    assert line in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert line in " ".join(capsys.readouterr().out.split())
 
 
 def test_summary_gives_the_truth_and_the_error(summary):

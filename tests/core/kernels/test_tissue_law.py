@@ -443,9 +443,11 @@ def test_a_tet_cut_by_a_lesion_has_the_mean_of_both_laws():
         ((0.1, 0.1005, 10.0), "0.1005"),
         ((0.1, float("nan"), 10.0), "nan"),
         ((0.1, 0.2, 101.0), "101"),
+        ((0.1, 0.2, 10.0, 0.0), "0.0"),
+        ((0.1, 0.2, 10.0, float("nan")), "nan"),
     ],
 )
-def test_a_law_out_of_range_is_refused(values: tuple[float, float, float], named: str):
+def test_a_law_out_of_range_is_refused(values: tuple[float, ...], named: str):
     with pytest.raises(OrganError, match=named):
         Stiffening(*values)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msdm_core import Material, box_mesh
+from msdm_core import Material, Stiffening, box_mesh
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
 from msdm_core.organ.measure import tissue_load
@@ -48,6 +48,20 @@ def test_a_stretched_and_turned_organ(organ, stretch):
     turn = np.array([[math.cos(angle), -math.sin(angle), 0.0], [math.sin(angle), math.cos(angle), 0.0], [0, 0, 1.0]])
     state.node_position[:] = (state.node_position * [stretch, 1.0, 1.0]) @ turn.T
     assert tissue_load(organ, state, NO_SHAPES, NO_CONTACT).strain == pytest.approx(abs(stretch - 1.0), rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-4, -1e-4])
+def test_equivalent_strain_is_that_of_a_bar(size):
+    """A block of stiffening tissue, sheared at constant volume by e along x and -e / 2 across: s = |e|."""
+    mesh = box_mesh((0.03, 0.03, 0.03), (6, 6, 6))
+    organ = compile_organ(OrganSpec(mesh, Material(5000.0, 1000.0, 0.45, Stiffening(0.1, 0.3, 5.0))))
+    state = rest_state(organ)
+    state.node_position[:] *= [1.0 + size, 1.0 - 0.5 * size, 1.0 - 0.5 * size]
+    load = tissue_load(organ, state, NO_SHAPES, NO_CONTACT)
+    # Nodes on an edge of the block have an eighth or a quarter of the lattice's directions.
+    assert load.equivalent_strain == pytest.approx(abs(size), rel=0.35)
+    linear = compile_organ(OrganSpec(mesh, Material(5000.0, 1000.0, 0.45)))
+    assert tissue_load(linear, state, NO_SHAPES, NO_CONTACT).equivalent_strain == 0.0
 
 
 def test_nothing_strained_at_rest(organ):

@@ -91,7 +91,7 @@ MODEL_FIELDS = (
     _field("tet_rest_volume", "m^3", "n_tet", "rest", "V0"),
     _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
     _field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
-    _field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
+    _field("tet_barrier_bulk", "Pa", "n_tet", "own", "whole volume modulus of a tet, of its barrier when squeezed"),
     _field("node_rest_volume", "m^3", "n_node", "rest", "volume averaged at a node, a quarter of its tets"),
     _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
     _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
@@ -198,7 +198,7 @@ class OrganModel(NamedTuple):
     tet_rest_volume: FloatArray
     tet_inverse_volume: FloatArray
     tet_bulk: FloatArray
-    tet_averaged_bulk: FloatArray
+    tet_barrier_bulk: FloatArray
     node_rest_volume: FloatArray
     node_inverse_volume: FloatArray
     node_bulk: FloatArray

@@ -131,7 +131,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         tet_rest_volume=mesh.volumes,
         tet_inverse_volume=1.0 / mesh.volumes,
         tet_bulk=bulk - averaged_bulk,
-        tet_averaged_bulk=averaged_bulk,
+        tet_barrier_bulk=bulk,
         node_rest_volume=node_volume,
         node_inverse_volume=1.0 / node_volume,
         node_bulk=node_bulk,

@@ -189,7 +189,7 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     Supports hold and drag each node with `support_hold`. Contact is implicit, with its damping and its friction, and
     takes `contact_excess` of the limit 2 (1 + e^(-alpha dt)) at most; the organ takes at most (dt / stable_step)^n of
     it (n = 2, with beta or damped supports 1). The implicit guard of the shapes' axes takes nothing; beta damps the
-    organ alone. The organ is linearised at rest: stretched by 20 % it is stable up to 0.92 to 0.96 of this step.
+    organ alone. The organ is linearised at rest.
     """
     own = model.stable_step
     if contact is None or not math.isfinite(own) or not np.any(model.node_inverse_mass):

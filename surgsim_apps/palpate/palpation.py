@@ -90,8 +90,9 @@ class PalpationResult:
         """Share of contrast - 1 that contact hides at the used site with the largest force."""
         scene = self.anatomy.scene
         pressed = [press for press, used in zip(self.presses, self.used, strict=True) if used]
-        slope = max(pressed, key=lambda press: press.force).slope
-        return hidden_share(slope, scene.instrument.tip_radius, scene.palpation.press_depth, scene.contact.stiffness)
+        hardest = max(pressed, key=lambda press: press.force)
+        tip, depth = scene.instrument.tip_radius, scene.palpation.press_depth
+        return hidden_share(hardest.force, hardest.slope, tip, depth, scene.contact.stiffness)
 
     @property
     def sites(self) -> FloatArray:

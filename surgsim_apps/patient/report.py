@@ -170,12 +170,12 @@ def _palpation(organ: PatientScene) -> Rows:
 
 
 def _hidden_text(hold: Hold, scene: Scene) -> str:
-    """`hidden_share` over a lesion with twice the slope of the steepest healthy press, in words."""
-    slope, contact = 2.0 * float(hold.slope.max()), scene.contact.stiffness
-    share = hidden_share(slope, scene.instrument.tip_radius, scene.palpation.press_depth, contact)
+    """`hidden_share` over a lesion with twice the force and the slope of the hardest healthy press, in words."""
+    force, slope, contact = 2.0 * float(hold.force.max()), 2.0 * float(hold.slope.max()), scene.contact.stiffness
+    share = hidden_share(force, slope, scene.instrument.tip_radius, scene.palpation.press_depth, contact)
     return (
-        f"contact hides about {share:.1%} of the contrast over 1 where force rises by {slope:.3g} N/m, twice as steep "
-        f"as in a healthy press: 3 F' / (2 pi k_p R d) with k_p {contact:.3g} N/m^3"
+        f"contact of {contact:.3g} N/m^3 hides about {share:.1%} of the contrast over 1 where a press feels "
+        f"{force:.2f} N, twice as much as a healthy one"
     )
 
 

@@ -279,8 +279,10 @@ def liver_contrast() -> Iterator[Row]:
         )  # fmt: skip
     soft = liver_reference(LIVER_SPHERE, scene.contact.stiffness)
     hidden = 1.0 - (soft / liver_reference(None, scene.contact.stiffness) - 1.0) / rigid
+    # n of F ~ d^n by differences of second order.
+    slope = np.gradient(np.log(soft), np.log(LIVER_DEPTHS), edge_order=2) * soft / LIVER_DEPTHS
     for number, depth in enumerate(LIVER_DEPTHS):
-        formula = hidden_share(float(soft[number]), tip, depth, scene.contact.stiffness)
+        formula = hidden_share(float(soft[number]), float(slope[number]), tip, depth, scene.contact.stiffness)
         yield bounded(
             f"hidden by contact, the same sphere, pressed {1e3 * depth:g} mm", "scikit-fem, k_p of the scene or rigid",
             measured=hidden[number], most=0.05,

@@ -85,7 +85,7 @@ def test_a_softer_contact_takes_what_is_said():
     """
     body = PressedLayer(layer_mesh(0.08, 0.08, 1e-3, (0.016, 0.012)), uniform(5000.0), 0.45)
     rigid, soft = (body.forces(0.012, (0.003,), k)[0] for k in (RIGID, 2e7))
-    share = hidden_share(rigid, 0.012, 0.003, 2e7)
+    share = hidden_share(rigid, 1.5 * rigid / 0.003, 0.012, 0.003, 2e7)
     assert 0.35 * share < 1.0 - soft / rigid < 0.65 * share
 
 

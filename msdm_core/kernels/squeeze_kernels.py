@@ -34,12 +34,6 @@ from msdm_core.kernels.space_kernels import (
 )
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
-# Implicit stiffness of a steep spring over the rise of its tangent: a larger factor needs fewer sweeps for the fast
-# motions, and makes the slow motions heavier. Measured on bars of springs with 60 times the tangent at rest: 8, 12 and
-# 16 sweeps are stable up to 29, 38 and 49 times that tangent at the step of the linear organ; a factor of 1 needs twice
-# as many sweeps.
-STEEP_HOLD = 3.0
-VOLUME_HOLD = 0.35
 # Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
 # ends' speeds by a pull of 1 N, and its pull so far.
 STEEP_WIDTH = 6
@@ -130,9 +124,9 @@ def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
 def hold_steep(lanes, model, state, count, sweeps_least, dt):
     """Implicit rise of the tangent of steep springs: tension T + dt K dl/dt at the step's end.
 
-    K = STEEP_HOLD k q (1 + sum g_i), with q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy over
-    its springs is nowhere above that of springs with q alone, which would limit the step. The tissue kernel has applied
-    T. For the springs with q above STEEP_EXCESS this kernel solves for the remainder, p = dt K d(l)/dt with the speeds
+    K = h q with the model's `spring_hold` h and q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy
+    over springs and volumes is nowhere above that of (1 + q) times the linear ones, which would limit the step; h is
+    large enough for the springs to hold volumes too. The tissue kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves for the remainder, p = dt K d(l)/dt with the speeds
     at the end of the step, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
     in order and in reverse in turn, from p = 0. After each pair of sweeps the result is that of symplectic Euler with
     larger masses, M <= M' <= M + dt^2 K, symmetric, so that no energy is made; the error of the sweeps is smallest in

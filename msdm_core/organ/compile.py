@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
-from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, VOLUME_HOLD
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
@@ -41,7 +40,7 @@ from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.foundation import Foundation, foundation_fields
 from msdm_core.organ.measure import element_strains, element_tensions
 from msdm_core.organ.motion import Motion, motion_fields
-from msdm_core.organ.stability import own_step, steep_sweeps
+from msdm_core.organ.stability import STEEP_HOLD, VOLUME_HOLD, own_step, steep_sweeps
 from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
@@ -348,9 +347,7 @@ def _tissue_law(
         fields["node_excess"] = rise * width
         fields["steep_rise"] = _steep_rise(onset, width, rise, nodes)
     if fields["relaxes"]:
-        moduli = np.stack(
-            [np.concatenate([spring_mean(arm), arm, node_mean(arm, weight)]) for arm in law.arm_modulus]
-        )
+        moduli = np.stack([np.concatenate([spring_mean(arm), arm, node_mean(arm, weight)]) for arm in law.arm_modulus])
         fields["element_gain"] = 1.0 + moduli.sum(axis=0)
         fields["element_arm_modulus"] = moduli.ravel()
     if fields["stiffens"]:

@@ -17,6 +17,7 @@ from msdm_core.kernels.layout_kernels import (
     group_width,
     load_column,
     load_item,
+    load_shared,
     set_node,
     store_column,
     take_from_node,
@@ -124,10 +125,11 @@ def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
 def hold_steep(lanes, model, state, count, sweeps_least, dt):
     """Implicit rise of the tangent of steep springs: tension T + dt K dl/dt at the step's end.
 
-    K = h q with the model's `spring_hold` h and q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy
-    over springs and volumes is nowhere above that of (1 + q) times the linear ones, which would limit the step; h is
-    large enough for the springs to hold volumes too. The tissue kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves for the remainder, p = dt K d(l)/dt with the speeds
-    at the end of the step, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
+    K = h q (1 + sum g_i) with the model's `spring_hold` h and q the mean of (c - 1) v^2 of both ends: the tangent of a
+    node's energy over springs and volumes is nowhere above that of linear ones times 1 + q, which would limit the step;
+    h is large enough for the springs to hold volumes too. The tissue kernel has applied T. For the springs with q above
+    STEEP_EXCESS this kernel solves for the remainder, p = dt K d(l)/dt with the speeds at the end of the step, from the
+    masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
     in order and in reverse in turn, from p = 0. After each pair of sweeps the result is that of symplectic Euler with
     larger masses, M <= M' <= M + dt^2 K, symmetric, so that no energy is made; the error of the sweeps is smallest in
     the fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A
@@ -157,6 +159,8 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             along = divided(along, spring_length(along))
             # Each of several organs side by side has its own steep springs.
             tangent = keep_lower(none + STEEP_EXCESS, more, load_item(lanes, hold, spring) * more, none)
+            if model.relaxes:
+                tangent = tangent * load_shared(lanes, steepness, model.element_gain, spring)
             give = dt * load_item(lanes, inverse_mass, i) + dt * load_item(lanes, inverse_mass, j)
             places[held] = spring
             store_column(lanes, rows, STEEP_WIDTH, held, 0, along[0])

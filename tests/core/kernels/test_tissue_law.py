@@ -408,7 +408,8 @@ def test_steep_springs_are_held_as_by_larger_masses(relaxation: Relaxation | Non
     length = np.linalg.norm(span, axis=1)
     state.node_steepness[:] = law.tangent(equivalent_strain(model, state)) - 1.0
     more = state.node_steepness[model.spring_nodes].mean(axis=1)
-    tangent = model.spring_hold * np.where(more > STEEP_EXCESS, more, 0.0)
+    gain = 1.0 if relaxation is None else relaxation.instantaneous
+    tangent = gain * model.spring_hold * np.where(more > STEEP_EXCESS, more, 0.0)
     along = np.zeros((len(span), len(mesh.points), 3))
     rows = np.arange(len(span))
     along[rows, model.spring_nodes[:, 1]] = span / length[:, None]

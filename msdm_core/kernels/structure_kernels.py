@@ -91,7 +91,7 @@ MODEL_FIELDS = (
     _field("tet_rest_volume", "m^3", "n_tet", "rest", "V0"),
     _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
     _field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
-    _field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
+    _field("tet_barrier_bulk", "Pa", "n_tet", "own", "whole volume modulus of a tet, of its barrier when squeezed"),
     _field("node_rest_volume", "m^3", "n_node", "rest", "volume averaged at a node, a quarter of its tets"),
     _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
     _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
@@ -152,7 +152,7 @@ SCRATCH_FIELDS = (
     _field("steep_springs", "", "n_steep", "shared", "groups of springs with any steep", "int32"),
     _field("steep_places", "", "n_steep", "shared", "steep springs, see squeeze_kernels", "int32"),
     _field("steep_rows", "", "n_steep steep_width", "own", "likewise"),
-    _field("steep_speed", "m/s", "n_soft 3", "own", "speed of their nodes after all forces"),
+    _field("steep_speed", "m/s", "n_soft 3", "own", "change of speed of their nodes, see there"),
     _field("contact_candidates", "", "n_shape n_surface", "rows", "triangles in reach, shape by shape", "int32"),
     _field("contact_rows", "", "n_row row_width", "turns", "a row for each point in contact"),
     _field("contact_places", "", "n_row place_width", "turns", "shape, point and nodes of each row", "int32"),
@@ -198,7 +198,7 @@ class OrganModel(NamedTuple):
     tet_rest_volume: FloatArray
     tet_inverse_volume: FloatArray
     tet_bulk: FloatArray
-    tet_averaged_bulk: FloatArray
+    tet_barrier_bulk: FloatArray
     node_rest_volume: FloatArray
     node_inverse_volume: FloatArray
     node_bulk: FloatArray

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError, OrganError
 from msdm_core.kernels.element_kernels import STEEP_EXCESS
+from msdm_core.kernels.squeeze_kernels import STEEP_HOLD, VOLUME_HOLD
 from msdm_core.kernels.structure_kernels import FAULT_NONE, OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.kernels.support_kernels import add_foundation_forces, add_support_forces
@@ -40,7 +41,7 @@ from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.foundation import Foundation, foundation_fields
 from msdm_core.organ.measure import element_strains, element_tensions
 from msdm_core.organ.motion import Motion, motion_fields
-from msdm_core.organ.stability import STEEP_HOLD, VOLUME_HOLD, own_step, steep_sweeps
+from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import NO_CONTACT, NO_SHAPES, advance_organ, describe_fault
 from msdm_core.organ.support import Support, SupportLaw, support_fields
@@ -130,7 +131,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         tet_rest_volume=mesh.volumes,
         tet_inverse_volume=1.0 / mesh.volumes,
         tet_bulk=bulk - averaged_bulk,
-        tet_averaged_bulk=averaged_bulk,
+        tet_barrier_bulk=bulk,
         node_rest_volume=node_volume,
         node_inverse_volume=1.0 / node_volume,
         node_bulk=node_bulk,

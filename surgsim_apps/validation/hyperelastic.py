@@ -287,8 +287,8 @@ class OrganBlock:
         ratio = 1.0 + strain[springs : springs + tets]
         squeezed = ratio < SQUEEZED_RATIO
         share = SQUEEZED_RATIO / ratio[squeezed]
-        pressure[squeezed] += model.tet_averaged_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
-        slope[squeezed] = model.tet_averaged_bulk[squeezed] * share**2
+        pressure[squeezed] += model.tet_barrier_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
+        slope[squeezed] = model.tet_barrier_bulk[squeezed] * share**2
         blocks = (slope / model.tet_rest_volume)[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
         blocks += pressure[:, None, None] * _volume_curvature(position[model.tet_nodes])
         return csc_array(total + bent + block_sum(blocks, node_rows(model.tet_nodes), count))

@@ -15,7 +15,7 @@ from surgsim_apps.palpate.contrast_map import ContrastMap
 from surgsim_apps.palpate.hold import Hold
 from surgsim_apps.palpate.misses import Miss
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, PalpationResult
-from surgsim_env.scene import contact_radius
+from surgsim_env.scene import contact_radius, mesh_bias
 
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "palpation.csv", "summary.json", "report.html"
 PICTURE_NAME, ORGAN_NAME = "stiffness_map.png", "organ.png"
@@ -66,6 +66,7 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
             "tip_radius_m": tip,
             "cell_m": cell,
             "cell_over_contact_radius": cell / contact_radius(tip, depth),
+            "force_added_by_mesh": mesh_bias(cell, tip, depth),
             "contact_stiffness_N_per_m3": scene.contact.stiffness,
             "contrast_hidden_by_contact": palpation.hidden_share,
             "spacing_m": scene.palpation.site_spacing,

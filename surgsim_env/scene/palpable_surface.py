@@ -292,6 +292,8 @@ def _drop(plane: FloatArray, height: FloatArray, u: float, v: float) -> tuple[in
 
 # Largest cell over contact radius; on coarser cells the force varies more between sites than over a deep lesion.
 SHARE_LARGEST = 1.0
+# Relative bias of a press at cell = contact radius: on blocks, and on filled surfaces.
+MESH_BIAS = (0.05, 0.09)
 
 
 def contact_radius(tip_radius: float, press_depth: float) -> float:
@@ -299,10 +301,26 @@ def contact_radius(tip_radius: float, press_depth: float) -> float:
     return math.sqrt(tip_radius * press_depth)
 
 
-def share_text(cell: float, tip_radius: float, press_depth: float) -> str:
-    """Cell over contact radius in words, with the consequence above SHARE_LARGEST."""
+def mesh_bias(cell: float, tip_radius: float, press_depth: float) -> tuple[float, float]:
+    """Estimate of the force that the mesh adds to a press, over that of infinitely small cells: least and most.
+
+    MESH_BIAS (h / a)^2 with cells h at the surface and the contact radius a. Presses of balls into linear tissue: blocks,
+    of one size or graded, are at the least, filled surfaces at the most; single places scatter by a third of the estimate
+    around it. Stiffening tissue is touched over a wider patch, and its presses have about half the bias.
+    """
     share = cell / contact_radius(tip_radius, press_depth)
-    text = f"{share:.2f} (cell {cell * 1e3:.3g} mm, tip {tip_radius * 1e3:.3g} mm, pressed {press_depth * 1e3:.3g} mm)"
+    least, most = (factor * share * share for factor in MESH_BIAS)
+    return least, most
+
+
+def share_text(cell: float, tip_radius: float, press_depth: float) -> str:
+    """Cell over contact radius in words, with `mesh_bias` and the consequence above SHARE_LARGEST."""
+    share = cell / contact_radius(tip_radius, press_depth)
+    least, most = mesh_bias(cell, tip_radius, press_depth)
+    text = (
+        f"{share:.2f} (cell {cell * 1e3:.3g} mm, tip {tip_radius * 1e3:.3g} mm, pressed {press_depth * 1e3:.3g} mm; "
+        f"the mesh adds about {least:.0%} to {most:.0%} to the force)"
+    )
     return f"{text}: above {SHARE_LARGEST:g}, the mesh itself is felt" if share > SHARE_LARGEST else text
 
 

@@ -28,6 +28,7 @@ from surgsim_env.scene import (
     TissueRegion,
     Vector,
     anatomy_of,
+    contact_radius,
     hertz_force,
     make_scene,
     with_substeps,
@@ -47,7 +48,9 @@ class PalpationLayout:
     """Numbers of the scene in proportion to tip, press and cells, as in the scene liver; the others are chosen.
 
     Fields:
-        contact_share: contact stiffness times cell over Young's modulus: about 0.2 mm of penetration in a press
+        contact_share: contact stiffness times contact radius over Young's modulus: hides a few per cent of a contrast
+            over 1
+        contact_stiffness_most: what the probe of 0.18 kg bears [N/m^3]
         spacing_per_tip, spacing_step: spacing of sites over the tip's radius, and the step of its rounding [m]
         sites_most: a raster of more sites takes minutes: its spacing is then enlarged
         thicknesses: least thickness of organ below a site, in press depths; the first that leaves any site is taken
@@ -57,7 +60,8 @@ class PalpationLayout:
         lesion_shrinks: factors on these ranges, tried in turn for organs without enough room
     """
 
-    contact_share: float = 18.0
+    contact_share: float = 200.0
+    contact_stiffness_most: float = 2.5e8
     spacing_per_tip: float = 13.0 / 12.0
     spacing_step: float = 5e-4
     sites_most: int = 60
@@ -153,7 +157,7 @@ def _first_scene(
     options: SceneOptions,
 ) -> Scene:
     """The scene by the touch, the cells and the tissue, without anchors, thickness and hidden lesions."""
-    liver, cell = make_scene(PATTERN), patient.cell_size
+    liver = make_scene(PATTERN)
     tip, depth = touch.tip_radius, touch.press_depth
     press = hertz_force(material, tip, depth)
     usual = approach_of(options, is_scan=patient.is_scan)
@@ -168,7 +172,7 @@ def _first_scene(
         folder=out.parent,
         mesh=mesh_source(out, patient.surface),
         material=material,
-        contact=replace(liver.contact, stiffness=_digits(LAYOUT.contact_share * material.youngs_modulus / cell, 3)),
+        contact=replace(liver.contact, stiffness=_contact_stiffness(material, contact_radius(tip, depth))),
         limits=Limits(_digits(LAYOUT.soft_per_press * press, 2), _digits(LAYOUT.hard_per_press * press, 2)),
         palpation=PalpationSettings(
             press_depth=depth,
@@ -185,6 +189,11 @@ def _first_scene(
     scene = with_options(scene, replace(options, approach=approach, tip_radius=tip, press_depth=depth))
     x, y, z = (round(part, 6) + 0.0 for part in scene.instrument.approach)
     return replace(scene, instrument=replace(scene.instrument, approach=(x, y, z)))
+
+
+def _contact_stiffness(material: Material, radius: float) -> float:
+    """Contact stiffness [N/m^3] for a contact radius [m]."""
+    return min(_digits(LAYOUT.contact_share * material.youngs_modulus / radius, 3), LAYOUT.contact_stiffness_most)
 
 
 def _with_sites(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple[Anatomy, int]:

@@ -29,7 +29,7 @@ def scene_text(organ: PatientScene) -> str:
         "cranial": "where the head is, for motions" if patient.is_scan else "where the head is: chosen, for motions",
         **organ.anchor_sources,
         "mesh.fine_surface": "what pictures and the live page draw; delete it to see the boundary of the tets",
-        "contact.stiffness": "[N/m^3] chosen: 18 E / cell",
+        "contact.stiffness": "[N/m^3] chosen: 200 E / contact radius, at most 2.5e8",
         "contact.damping": "[N s/m^3] as in the scene liver",
         "contact.friction": "as in the scene liver",
         "instrument.tip_radius": f"[m] chosen with the cells: cell / contact radius {share:.2f}",

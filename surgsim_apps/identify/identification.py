@@ -385,7 +385,7 @@ def _warnings(result: Identification, library: PressLibrary) -> list[str]:
     for dataset in result.sets:
         for reason, sites in dataset.left_out.items():
             kept_in = dataset.kept_in.get(reason)
-            error = f"with them kept in, {kept_in.median:.1%}" if kept_in else "no force of theirs is above 0"
+            error = f"with them kept in, {kept_in.median:.1%}" if kept_in else "none of their deeper forces is above 0"
             warnings.append(
                 f"{dataset.recording.name}, left out: {len(sites)} of {len(dataset.recording.presses)} sites "
                 f"({reason}); {error}: sites {_listed(sites)}"

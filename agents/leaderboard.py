@@ -13,6 +13,7 @@ from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.figures import ScoreEstimate
 from surgsim_apps.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
+from surgsim_env.scene import PHYSICS_VERSION
 
 LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
 
@@ -71,7 +72,7 @@ def write_leaderboard(folder: Path, path: Path) -> None:
         (files / path.name).write_text("\n".join(parts), encoding="utf-8")
 
 
-HEADER = """# Leaderboard
+HEADER = f"""# Leaderboard
 
 Written by `python -m agents.leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
 Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
@@ -80,7 +81,8 @@ shown are the best of those tried, by presses to 5 mm, then by the error over al
 **sees truth** know what is hidden: `truth` reports it, the oracles press with that knowledge. Where the patient moves,
 presses and oracles track the surface by markers; methods whose name ends in `untracked` press at the rest position.
 How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
-`surgsim evaluate --compare A.json B.json`, for results of one version of the physics.
+`surgsim evaluate --compare A.json B.json`, for results of one version of the physics. The engine has physics
+{PHYSICS_VERSION}; a method with "physics" and another number was played on an older one and not since.
 """
 
 
@@ -161,7 +163,8 @@ def _line(cells: Sequence[str]) -> str:
 def _name(result: Result) -> str:
     side = result.method.removeprefix("raster_")
     name = f"raster {side} x {side}" if side != result.method else result.method
-    return name + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate
+    older = f" (physics {result.physics_version})" * (result.physics_version != PHYSICS_VERSION)
+    return name + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate + older
 
 
 def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:
@@ -180,8 +183,10 @@ def _number(value: float | None, decimals: int, factor: float) -> str:
 
 
 def _commands(results: Sequence[Result]) -> str:
-    lines = ["\n## Commands\n", _line(["command", "wall time [s]", "date"]), _line(["---"] * 3)]
-    lines += [_line([f"`{row.command}`", f"{row.wall_time:.0f}", row.date]) for row in results]
+    lines = ["\n## Commands\n", _line(["command", "wall time [s]", "date", "physics"]), _line(["---"] * 4)]
+    lines += [
+        _line([f"`{row.command}`", f"{row.wall_time:.0f}", row.date, str(row.physics_version)]) for row in results
+    ]
     return "\n".join([*lines, "", "Wall times were measured on a 2-core machine under other load.", ""])
 
 

@@ -42,6 +42,10 @@ QUADRATURE_BARYCENTRIC = np.array(
     ]
 )
 
+# Share of the rise of the edges opposite to corners a, b and c at each point: 4 lambda_b lambda_c and so on.
+QUADRATURE_RISE = 4.0 * QUADRATURE_BARYCENTRIC[:, [1, 2, 0]] * QUADRATURE_BARYCENTRIC[:, [2, 0, 1]]
+_NONE = (0.0, 0.0, 0.0)
+
 # A row of `contact_rows`, one engaged quadrature point: slope of its penetration g with its three corners, norms of
 # those slopes, weighted area, pressure, unit vector e, stretch.
 ROW_SLOPE, ROW_NORM, ROW_AREA, ROW_PRESSURE, ROW_OUT, ROW_STRETCH = 0, 9, 12, 13, 14, 17
@@ -149,10 +153,10 @@ def may_meet(position, surface, engaged, shapes, shape, triangle):
     """True if a shape is in contact with a triangle, or may contain one of its points now."""
     if _is_held(engaged, shape, triangle):
         return True
-    # Quadrature points lie within half of that radius around the middle.
+    # Quadrature points of the flat triangle lie within half of that radius around the middle; the rise adds less.
     middle, size_squared = _middle(position, row_of(surface, triangle))
     away = minus(middle, closest_on_core(shapes, shape, middle))
-    limit = 0.5 * math.sqrt(size_squared) + shapes.shape_radius[shape]
+    limit = math.sqrt(size_squared) + shapes.shape_radius[shape]
     return not scalar_product(away, away) > limit * limit
 
 
@@ -167,9 +171,52 @@ def facet_of(position, surface, triangle):
 
 
 @njit(**INLINED)
+def rise_of(position, model, triangle):
+    """Rise of the middle of each edge of a triangle over the edge [m], of those opposite to corners a, b and c."""
+    around, weight = model.surface_around, model.surface_rise
+    at_a, at_b, at_c = _NONE, _NONE, _NONE
+    for entry in range(around.shape[1]):
+        place = row_of(position, around[triangle, entry])
+        at_a = shifted(at_a, weight[triangle, entry, 0], place)
+        at_b = shifted(at_b, weight[triangle, entry, 1], place)
+        at_c = shifted(at_c, weight[triangle, entry, 2], place)
+    return at_a, at_b, at_c
+
+
+@njit(**INLINED)
+def risen(place, rise, point):
+    """Place of a quadrature point on the quadratic triangle, from that on the flat one."""
+    place = shifted(place, QUADRATURE_RISE[point, 0], rise[0])
+    place = shifted(place, QUADRATURE_RISE[point, 1], rise[1])
+    return shifted(place, QUADRATURE_RISE[point, 2], rise[2])
+
+
+@njit(**INLINED)
+def slope_of(rows, row):
+    """Slope of a point's penetration with its place: the sum of those with its corners."""
+    return plus(
+        plus(part_of_row(rows, row, ROW_SLOPE), part_of_row(rows, row, ROW_SLOPE + 3)),
+        part_of_row(rows, row, ROW_SLOPE + 6),
+    )
+
+
+@njit(**INLINED)
+def push_around(position, force, reference, wrench, tool, model, triangle, pushes):
+    """Add the forces on the rise of a triangle's edges to the nodes around it, and their reaction."""
+    around, weight = model.surface_around, model.surface_rise
+    for entry in range(around.shape[1]):
+        share = times(weight[triangle, entry, 0], pushes[0])
+        share = shifted(share, weight[triangle, entry, 1], pushes[1])
+        share = shifted(share, weight[triangle, entry, 2], pushes[2])
+        node = around[triangle, entry]
+        add_to_row(force, node, share)
+        react(wrench, reference, tool, row_of(position, node), share)
+
+
+@njit(**INLINED)
 def press_point(
     position, velocity, rest_area, engaged, stretch_memory, rows, places, shapes, law, dt, shape, triangle, facet,
-    point, row,
+    rise, point, row,
 ):  # fmt: skip
     """Contact of one quadrature point with one shape, see `add_contact_forces`.
 
@@ -182,7 +229,7 @@ def press_point(
     weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
     item = triangle * QUADRATURE_COUNT + point
     weights = row_of(QUADRATURE_BARYCENTRIC, point)
-    place = _mean(position, corners, weights)
+    place = risen(_mean(position, corners, weights), rise, point)
     near = closest_on_core(shapes, shape, place)
     away = minus(place, near)
     t = scalar_product(away, normal)
@@ -280,11 +327,12 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 break
             if not may_meet(position, surface, engaged, shapes, shape, triangle):
                 continue
-            facet = facet_of(position, surface, triangle)
+            facet, rise = facet_of(position, surface, triangle), rise_of(position, model, triangle)
+            push_a, push_b, push_c = _NONE, _NONE, _NONE
             for point in range(QUADRATURE_COUNT):
                 if not press_point(
                     position, velocity, rest_area, engaged, stretch_memory, rows, places, shapes, law, dt, shape,
-                    triangle, facet, point, count,
+                    triangle, facet, rise, point, count,
                 ):  # fmt: skip
                     continue
                 push, drag = first_push(rows, count, law)
@@ -294,7 +342,12 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                     _push_corner(
                         position, force, reference, wrench, tool, node, rows, count, corner, push, weight, drag
                     )
+                along = opposite(times(push, slope_of(rows, count)))
+                push_a = shifted(push_a, QUADRATURE_RISE[point, 0], along)
+                push_b = shifted(push_b, QUADRATURE_RISE[point, 1], along)
+                push_c = shifted(push_c, QUADRATURE_RISE[point, 2], along)
                 count += 1
+            push_around(position, force, reference, wrench, tool, model, triangle, (push_a, push_b, push_c))
     return count
 
 

@@ -10,9 +10,9 @@ from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL
 from msdm_core.kernels.space_kernels import scalar_product, vector_product
 from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 
-# Below this volume ratio s a tet also has a barrier pressure for the share K' of its volume term averaged at nodes: an
-# average alone lets single tets collapse between swollen neighbours. Its energy K' s V0 ((J - s) - s ln(J / s)) is
-# unbounded at J = 0. With a linear term instead, tets inverted at 50 to 80 % of the force.
+# Below this volume ratio s a tet also has a barrier pressure of its whole volume modulus K': a finite energy at J = 0 lets
+# single tets collapse between swollen neighbours. Its energy K' s V0 ((J - s) - s ln(J / s)) is unbounded at J = 0. With
+# a linear term instead, tets inverted at 50 to 80 % of the force.
 SQUEEZED_RATIO = 0.6
 # Rise of a spring's tangent over that at rest above which the spring is steep: its rise is then integrated implicitly.
 # A smaller rise counts in `stability.stable_dt`.
@@ -117,19 +117,19 @@ def six_rates(b, c, d, b_rate, c_rate, d_rate):
 
 
 @njit(**INLINED)
-def tet_scale(ratio, own_tension, averaged_bulk, averaged_tension):
+def tet_scale(ratio, own_tension, barrier_bulk, averaged_tension):
     """Factor from six times the gradients dV/dx to the forces of a tet on its corners: minus a sixth of its tension.
 
     The tension is its own, of K (J - 1), plus the mean tension of the volumes averaged at its corners, plus
     K' (J - s) s / J for J below s = SQUEEZED_RATIO.
 
-    In: ratio J, own_tension [Pa], averaged_bulk K' [Pa], averaged_tension [Pa]
+    In: ratio J, own_tension [Pa], barrier_bulk K' [Pa], averaged_tension [Pa]
     Returns [Pa].
     """
     tension = own_tension + averaged_tension
     # A quotient takes as long as ten products.
     if any_below(ratio, SQUEEZED_RATIO):
-        tension = tension + averaged_bulk * (below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio))
+        tension = tension + barrier_bulk * (below_zero(ratio - SQUEEZED_RATIO) * (SQUEEZED_RATIO / ratio))
     return tension * (-1.0 / 6.0)
 
 

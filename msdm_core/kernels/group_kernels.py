@@ -226,7 +226,7 @@ def add_tet_groups(model, state, law, steep_count):
         if model.relaxes:
             pull = _relaxed(model, state, law, first, pull, share)
             own = _relaxed(model, state, law, springs + first, own, 1.0)
-        scale = tet_scale(ratio, own, load_group(model.tet_averaged_bulk, first), 0.25 * averaged)
+        scale = tet_scale(ratio, own, load_group(model.tet_barrier_bulk, first), 0.25 * averaged)
         at_b = minus(times(scale, gradient), times(pull, b))
         at_c, at_d = times(scale, vector_product(d, b)), times(scale, vector_product(b, c))
         push_corners(force, tets, first, (at_b, at_c, at_d))

@@ -42,6 +42,8 @@ class SurfaceView(NamedTuple):
 
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
+    surface_around: NDArray[np.int32]
+    surface_rise: FloatArray
     node_inverse_mass: LaneArray
 
 
@@ -142,6 +144,13 @@ def _triangles_of(values, lane, count):
 
 
 @njit(**INLINED_VIEW)
+def _weights_of(values, lane, count):
+    if values.ndim == 4:
+        return values[lane, :count]
+    return values
+
+
+@njit(**INLINED_VIEW)
 def _numbers_of(values, lane, count):
     if values.ndim == 2:
         return values[lane, :count]
@@ -156,6 +165,7 @@ def surface_of(lanes, model, lane):
     count = model.surface_count[lane]
     return SurfaceView(
         _triangles_of(model.surface_triangles, lane, count), _numbers_of(model.surface_rest_area, lane, count),
+        _triangles_of(model.surface_around, lane, count), _weights_of(model.surface_rise, lane, count),
         model.node_inverse_mass[:, lane],
     )  # fmt: skip
 

@@ -14,6 +14,8 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_COUNT,
     QUADRATURE_WEIGHT,
     closest_on_core,
+    rise_of,
+    risen,
 )
 from msdm_core.kernels.element_kernels import tet_shape
 from msdm_core.kernels.option_kernels import KERNEL
@@ -35,7 +37,8 @@ from msdm_core.kernels.space_kernels import (
 def add_pressures(model, state, shapes, stiffness, push):
     """Contact force of each node as if along the normal: sum of w A k_p g (`add_contact_forces`).
 
-    Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,)
+    Model: model: surface_triangles (n_surface, 3), surface_rest_area [m^2] (n_surface,), surface_around,
+           surface_rise
     In:    state: node_position [m] (n_node, 3), contact_engaged (n_shape, n_surface * 4); shapes, stiffness k_p [N/m^3]
     Out:   push, added to [N] (n_node,)
     """
@@ -52,6 +55,7 @@ def add_pressures(model, state, shapes, stiffness, push):
             normal = vector_product(b_edge, c_edge)
             wb, wc = QUADRATURE_BARYCENTRIC[point, 1], QUADRATURE_BARYCENTRIC[point, 2]
             place = shifted(shifted(row_of(position, a), wb, b_edge), wc, c_edge)
+            place = risen(place, rise_of(position, model, triangle), point)
             out = minus(place, closest_on_core(shapes, shape, place))
             t = scalar_product(out, normal) / length_of(normal)
             chord_squared = radius * radius - (scalar_product(out, out) - t * t)

@@ -52,7 +52,7 @@ SWEEPS_LEAST = 4
 
 @njit(**INNER)
 def hold_squeezed(
-    position, velocity, force, inverse_mass, tets, inverse_volume, averaged_bulk, squeezed, count, width, dt
+    position, velocity, force, inverse_mass, tets, inverse_volume, barrier_bulk, squeezed, count, width, dt
 ):  # fmt: skip
     """Implicit pressure of squeezed tets: tension p + dt p' dJ/dt, with the speeds at the end of the step.
 
@@ -62,7 +62,7 @@ def hold_squeezed(
     positive.
 
     In:  position [m], velocity [m/s] (n_node, 3), inverse_mass [1/kg] (n_node,), tets (n_tet, 4), inverse_volume
-         [1/m^3], averaged_bulk [Pa] (n_tet,), squeezed: first of each `width` successive tets with a squeezed tet
+         [1/m^3], barrier_bulk [Pa] (n_tet,), squeezed: first of each `width` successive tets with a squeezed tet
          (n_tet,), count: entries of `squeezed`, width, dt [s]
     Out: force, added to [N] (n_node, 3)
     """
@@ -90,8 +90,8 @@ def hold_squeezed(
                     six_rate += slope * (velocity[node, axis] + rate * force[node, axis])
                     give += slope * slope * rate
             steepness = SQUEEZED_RATIO / ratio
-            tension = averaged_bulk[tet] * (ratio - SQUEEZED_RATIO) * steepness
-            stiffening = averaged_bulk[tet] * steepness * steepness * dt * (inverse_volume[tet] * (1.0 / 6.0))
+            tension = barrier_bulk[tet] * (ratio - SQUEEZED_RATIO) * steepness
+            stiffening = barrier_bulk[tet] * steepness * steepness * dt * (inverse_volume[tet] * (1.0 / 6.0))
             more = min(stiffening * six_rate / (1.0 + stiffening * give * (1.0 / 6.0)), -tension)
             for corner in range(4):
                 node = corners[corner]

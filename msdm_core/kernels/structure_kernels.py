@@ -91,13 +91,15 @@ MODEL_FIELDS = (
     _field("tet_rest_volume", "m^3", "n_tet", "rest", "V0"),
     _field("tet_inverse_volume", "1/m^3", "n_tet", "rest", "1 / V0"),
     _field("tet_bulk", "Pa", "n_tet", "own", "modulus of the volume term of each tet"),
-    _field("tet_averaged_bulk", "Pa", "n_tet", "own", "contribution of a tet to the averaged volume term"),
+    _field("tet_barrier_bulk", "Pa", "n_tet", "own", "whole volume modulus of a tet, of its barrier when squeezed"),
     _field("node_rest_volume", "m^3", "n_node", "rest", "volume averaged at a node, a quarter of its tets"),
     _field("node_inverse_volume", "1/m^3", "n_node", "rest", "1 / that"),
     _field("node_bulk", "Pa", "n_node", "own", "modulus of the volume term averaged at nodes"),
     _field("averages_volume", "", "", "own", "True if any node_bulk is above 0", "bool"),
     _field("surface_triangles", "", "n_surface 3", "rows", "triangles open to contact, outward", "int32"),
     _field("surface_rest_area", "m^2", "n_surface", "rows", ""),
+    _field("surface_around", "", "n_surface n_around", "rows", "nodes around each triangle, see EdgeRise", "int32"),
+    _field("surface_rise", "", "n_surface n_around 3", "rows", "their weights in the rise of its edges"),
     _field("support_kind", "", "n_support", "shared", "solids below it, PLANE, SPHERE, ...", "int32"),
     _field("support_position", "m", "n_support 3", "shared", "middle of each, or a plane's point"),
     _field("support_rotation", "", "n_support 3 3", "shared", "its axes in the world as columns"),
@@ -196,13 +198,15 @@ class OrganModel(NamedTuple):
     tet_rest_volume: FloatArray
     tet_inverse_volume: FloatArray
     tet_bulk: FloatArray
-    tet_averaged_bulk: FloatArray
+    tet_barrier_bulk: FloatArray
     node_rest_volume: FloatArray
     node_inverse_volume: FloatArray
     node_bulk: FloatArray
     averages_volume: bool
     surface_triangles: NDArray[np.int32]
     surface_rest_area: FloatArray
+    surface_around: NDArray[np.int32]
+    surface_rise: FloatArray
     support_kind: NDArray[np.int32]
     support_position: FloatArray
     support_rotation: FloatArray

@@ -295,7 +295,7 @@ def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference
     )  # fmt: skip
     hold_squeezed(
         touched.node_position, touched.node_velocity, touched.node_force, surface.node_inverse_mass, model.tet_nodes,
-        column_of(model.tet_inverse_volume, lane), column_of(model.tet_averaged_bulk, lane),
+        column_of(model.tet_inverse_volume, lane), column_of(model.tet_barrier_bulk, lane),
         state.squeezed_tets, squeezed_count, group_width(lanes), dt,
     )  # fmt: skip
 

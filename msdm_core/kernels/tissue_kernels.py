@@ -426,7 +426,7 @@ def add_tet_forces(lanes, model, state, law, steep_count):
         if model.relaxes:
             pull = relaxed(lanes, model, state, law, tet, pull, share)
             own = relaxed(lanes, model, state, law, springs + tet, own, 1.0)
-        scale = tet_scale(ratio, own, load_item(lanes, model.tet_averaged_bulk, tet), averaged)
+        scale = tet_scale(ratio, own, load_item(lanes, model.tet_barrier_bulk, tet), averaged)
         at_b = minus(times(scale, gradient), times(pull, b))
         _push_corners(lanes, force, tets, tet, scale, b, c, d, at_b)
     store_item(lanes, low, 0, where_moving(lanes, state.moving, lowest, load_item(lanes, low, 0)))

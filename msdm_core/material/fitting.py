@@ -25,7 +25,8 @@ No published source is known for this fit; `FitReport` has its quality.
 The factors are those of the homogeneous organ: lesions change the formula's k_e, not s_e, so lesions may differ from
 reset to reset. With an 8x lesion the stiffness of a whole block is within 0.6 % of that of a fit with the lesion in it;
 a disc of 1.5 cells pressed onto the lesion within 1.5 %, single nodes above it within 14 %. The factors live as long as
-the mesh object.
+the mesh object. They do not depend on its scale: f and F grow as the square of length, w_i falls as that. So all sizes
+of a mesh (`TetMesh.scaled`) share them.
 """
 
 import math
@@ -118,11 +119,12 @@ _FITS: WeakKeyDictionary[TetMesh, SpringFit] = WeakKeyDictionary()
 
 
 def spring_fit(mesh: TetMesh) -> SpringFit:
-    """Fit of a mesh's homogeneous organ, made on first use and kept as long as the mesh lives.
+    """Fit of a mesh's homogeneous organ at any scale, made on first use and kept as long as the mesh lives.
 
     Warns:
         UserWarning: the network cannot represent the solid on this mesh; names the residual and the scalars in use.
     """
+    mesh = mesh if mesh.unscaled is None else mesh.unscaled
     fit = _FITS.get(mesh)
     if fit is None:
         fit = _FITS[mesh] = fit_springs(mesh)

@@ -1,6 +1,7 @@
 """Mass lumping: node masses from the density and each corner's share of a tet."""
 
 from typing import Literal, get_args
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,10 @@ MassScheme = Literal["barycentric", "voronoi"]
 
 # Tets in a batch: its pieces (up to nine per corner) take some tens of megabytes.
 _BATCH = 8192
+
+
+# Shares of the tets of a mesh, computed once.
+_VORONOI: WeakKeyDictionary[TetMesh, FloatArray] = WeakKeyDictionary()
 
 
 def lump_mass(mesh: TetMesh, density: ArrayLike, *, scheme: MassScheme) -> FloatArray:
@@ -29,7 +34,9 @@ def lump_mass(mesh: TetMesh, density: ArrayLike, *, scheme: MassScheme) -> Float
     if scheme == "barycentric":
         shares = np.full((mesh.tet_count, 4), 0.25)
     else:
-        shares = voronoi_fractions(mesh.points, mesh.tets)
+        if mesh not in _VORONOI:
+            _VORONOI[mesh] = voronoi_fractions(mesh.points, mesh.tets)
+        shares = _VORONOI[mesh]
     return np.bincount(mesh.tets.ravel(), (shares * tet_mass[:, None]).ravel(), mesh.node_count).astype(np.float64)
 
 

@@ -283,23 +283,27 @@ _BARYCENTRIC_SAMPLES = _barycentric_lattice(SAMPLES_PER_EDGE)
 
 
 # Up to this Poisson's ratio the volume term belongs to each tet. Above it tets lock in bending (a cosine load on few
-# cells: 1.48 x too stiff at 0.49, 1.17 x at 0.25), so the excess is averaged at nodes.
-POISSON_RATIO_PER_TET = 0.40
+# cells: 1.48 x too stiff at 0.49, 1.17 x at 0.25) and below a tip, so the excess is averaged at nodes.
+POISSON_RATIO_PER_TET = 0.35
 
 
-def averaged_volume_modulus(spring_modulus: FloatArray, volume_modulus: FloatArray) -> FloatArray:
-    """Part of each tet's volume modulus averaged at nodes, max(0, K_t - 3 mu) [Pa], shape (n_tet,).
+def averaged_volume_modulus(mesh: TetMesh, spring_modulus: FloatArray, volume_modulus: FloatArray) -> FloatArray:
+    """Part of each tet's volume modulus averaged at nodes, max(0, K_t - a mu) [Pa], shape (n_tet,).
 
-    K_t / mu = (4 nu - 1) / (1 - 2 nu), which is 3 at nu = 0.4, and mu = (2/5) E_s: up to 0.4 the part is 0.
+    K_t / mu = (4 nu - 1) / (1 - 2 nu), which is a at POISSON_RATIO_PER_TET, and mu = (2/5) E_s. Tets with a face on the
+    boundary keep all of it: the few tets around a node of the surface would let each other collapse below a tip.
 
     Args:
+        mesh: the organ's tets.
         spring_modulus: E_s of each tet [Pa], shape (n_tet,).
         volume_modulus: K_t of each tet [Pa], shape (n_tet,).
     """
     nu = POISSON_RATIO_PER_TET
     most = 0.4 * spring_modulus * ((4.0 * nu - 1.0) / (1.0 - 2.0 * nu))
     # Rounding must not average an organ of exactly that ratio.
-    return np.where(volume_modulus > most * (1.0 + 1e-9), volume_modulus - most, 0.0)
+    averaged = np.where(volume_modulus > most * (1.0 + 1e-9), volume_modulus - most, 0.0)
+    averaged[mesh.boundary_tets] = 0.0
+    return averaged
 
 
 def nodal_average(mesh: TetMesh, tet_modulus: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -45,6 +45,8 @@ class TetMesh:
     region_names: tuple[tuple[int, str], ...]
     # The mesh before it was moved.
     origin: "TetMesh | None" = field(init=False, default=None)
+    # The mesh before all its lengths were multiplied by a factor.
+    unscaled: "TetMesh | None" = field(init=False, default=None)
 
     def __init__(
         self,
@@ -90,6 +92,16 @@ class TetMesh:
         kept = {name: getattr(self, name) for name in ("tets", "region", "region_names", "_edge_table", "_boundary")}
         origin = self if self.origin is None else self.origin
         vars(other).update(points=_frozen(array), origin=origin, **kept)
+        return other
+
+    def scaled(self, factor: float) -> "TetMesh":
+        """The mesh with all lengths times a factor, `moved`; springs fitted to a mesh fit it at every scale.
+
+        Raises:
+            MeshError: a factor that is not positive.
+        """
+        other = self.moved(self.points * factor)
+        vars(other)["unscaled"] = self if self.unscaled is None else self.unscaled
         return other
 
     def region_tag(self, name: str) -> int:

@@ -202,8 +202,7 @@ def octree_tets(level: Int64Array) -> Int64Array:
 
     Between leaves of one size lie BCC tets (two centres and an edge of the face), cut in two by a corner of smaller
     leaves on that edge. A large leaf meets four small ones in eight quarters of a BCC tet around the centre of its
-    face; the small ones meet it in half pyramids, as they do the outside. An outer face with a corner on an edge is
-    cut from its centre.
+    face; the small ones meet it in half pyramids. Outer faces are cut from their centres: half BCC tets.
 
     Args:
         level: from `balanced_levels`, shape (nx, ny, nz).
@@ -249,7 +248,7 @@ def _face_tets(
     outside = (beyond[:, axis] < 0) | (beyond[:, axis] >= level.shape[axis])
     other = np.where(outside, size + 1, level[tuple(np.where(outside[:, None], 0, beyond).T)])
     is_cut = np.stack([is_node[tuple((centre + (ring[k] + ring[(k + 1) % 4]) // 2).T)] for k in range(4)], axis=1)
-    fanned = (other < size) | (outside & is_cut.any(axis=1))
+    fanned = (other < size) | outside
     halved = (other > size) & ~fanned
     tets = [_half_pyramids(centre[halved], ring, half)]
     for k in range(4):
@@ -270,7 +269,7 @@ def _half_pyramids(centre: Int64Array, ring: Int64Array, half: int) -> Int64Arra
     """Two tets per leaf on one face, cut along the diagonal through the centre of a twice as large neighbour's face.
 
     Of the four corners, counted in leaf widths, that centre is odd along both directions of the face and its
-    opposite even along both; on outer faces the same rule alternates like a checkerboard.
+    opposite even along both.
     """
     varying = np.flatnonzero(np.ptp(ring, axis=0))
     odd = ((centre + ring[0])[:, varying] // (2 * half)).sum(axis=1) % 2

@@ -27,9 +27,9 @@ GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB w
 def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float = 0.0) -> TetMesh:
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
-    Nodes are the corners and then the centres of the cells. Each inner cell face gives four tets (two centres and
-    an edge of the face). The diagonals of outer faces alternate like a checkerboard, so that the block prefers no
-    direction.
+    Nodes are the corners and centres of the cells and the centres of outer faces, along x, y and z in turn. Each inner
+    face of a cell gives four tets (two centres and an edge of the face), an outer face four of half their volume: its
+    triangles prefer no direction, and all its corners and all its centres yield alike.
 
     Args:
         size: edge lengths [m], shape (3,).
@@ -53,17 +53,13 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
             UserWarning,
             stacklevel=2,
         )
-    if coarsening > 1:
-        # Rounding must not add a layer to a depth of whole layers.
-        fine_layers = int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
-        return _graded_box(lengths, counts, coarsening, fine_layers)
-    corners = np.arange(np.prod(counts + 1)).reshape(counts + 1)
-    centres = corners.size + np.arange(np.prod(counts)).reshape(counts)
-    corner_places = np.stack(np.unravel_index(corners.ravel(), corners.shape), axis=1) / counts
-    centre_places = (np.stack(np.unravel_index(np.arange(centres.size), centres.shape), axis=1) + 0.5) / counts
-    points = np.concatenate([corner_places, centre_places]) * lengths
-    tets = np.concatenate([_face_tets(corners, centres, axis) for axis in range(3)])
-    return _swept_mesh(points, tets)
+    permitted = np.full(counts, COARSENINGS.index(coarsening), dtype=np.int64)
+    # Rounding must not add a layer to a depth of whole layers.
+    fine_layers = int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
+    permitted[:, :, counts[2] - fine_layers :] = 0
+    used, renumbered = np.unique(octree_tets(balanced_levels(permitted)), return_inverse=True)
+    places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
+    return _swept_mesh(places / (2 * counts) * lengths, renumbered.reshape(-1, 4))
 
 
 def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
@@ -75,31 +71,6 @@ def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Ar
     if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:
         raise ValueError(f"cells is {counts.tolist()}; that is more than {TET_LIMIT} tets: choose fewer cells")
     return lengths, counts.astype(np.int64)
-
-
-def _graded_box(lengths: FloatArray, counts: Int64Array, coarsening: int, fine_layers: int) -> TetMesh:
-    permitted = np.full(counts, COARSENINGS.index(coarsening), dtype=np.int64)
-    permitted[:, :, counts[2] - fine_layers :] = 0
-    used, renumbered = np.unique(octree_tets(balanced_levels(permitted)), return_inverse=True)
-    grid_places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
-    points = grid_places / (2 * counts) * lengths
-    return _swept_mesh(points, renumbered.reshape(-1, 4))
-
-
-def _face_tets(corners: Int64Array, centres: Int64Array, axis: int) -> Int64Array:
-    """Tets at the cell faces across one axis: four per inner face, two per outer face, shape (n, 4)."""
-    corners, centres = np.moveaxis(corners, axis, 0), np.moveaxis(centres, axis, 0)
-    faces = np.stack([corners[:, :-1, :-1], corners[:, 1:, :-1], corners[:, 1:, 1:], corners[:, :-1, 1:]], axis=-1)
-    inner = faces[1:-1].reshape(-1, 4)
-    below, above = centres[:-1].ravel(), centres[1:].ravel()
-    tets = [np.column_stack([below, above, inner[:, k], inner[:, (k + 1) % 4]]) for k in range(4)]
-    row, column = np.indices(centres.shape[1:]).reshape(2, -1)
-    shift = (row + column) % 2
-    for layer in (0, -1):
-        centre = centres[layer].ravel()
-        turned = np.take_along_axis(faces[layer].reshape(-1, 4), (np.arange(4) + shift[:, None]) % 4, axis=1)
-        tets += [np.column_stack([centre, turned[:, [0, 1, 2]]]), np.column_stack([centre, turned[:, [0, 2, 3]]])]
-    return np.concatenate(tets)
 
 
 def mesh_surface(

@@ -34,6 +34,7 @@ from msdm_core.material.regions import (
 )
 from msdm_core.material.stiffness import membrane_stiffness, spring_network, spring_sum
 from msdm_core.material.tissue_law import ARM_COUNT, Stiffening
+from msdm_core.mesh.curvature import boundary_rise
 from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh, area_vectors
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
@@ -103,7 +104,7 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     mesh = spec.mesh
     _check_extent(mesh)
     spring_modulus, bulk, density, law = _tet_properties(spec)
-    averaged_bulk = averaged_volume_modulus(spring_modulus, bulk)
+    averaged_bulk = averaged_volume_modulus(mesh, spring_modulus, bulk)
     node_volume, node_bulk = nodal_average(mesh, averaged_bulk)
     nodes, stiffness = spring_network(mesh, spring_modulus, rule=spec.stiffness_rule)
     if spec.capsule is not None and spec.capsule.thickness is not None:
@@ -113,7 +114,9 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
     nodes, stiffness = nodes[order.springs], stiffness[order.springs]
     tissue_law = _tissue_law(spec, law, spring_modulus, bulk, order.springs, stiffness)
     anchored = _anchor_mask(spec.anchors, mesh.node_count)
-    surface = mesh.boundary_triangles[~anchored[mesh.boundary_triangles].all(axis=1)]
+    open_triangles = ~anchored[mesh.boundary_triangles].all(axis=1)
+    surface = mesh.boundary_triangles[open_triangles]
+    rise = boundary_rise(mesh)
     supports = support_fields(spec.supports, spec.support_law, mesh, surface, anchored)
     foundations = foundation_fields(spec.foundations, mesh, anchored)
     model = OrganModel(
@@ -128,13 +131,15 @@ def compile_organ(spec: OrganSpec) -> OrganModel:
         tet_rest_volume=mesh.volumes,
         tet_inverse_volume=1.0 / mesh.volumes,
         tet_bulk=bulk - averaged_bulk,
-        tet_averaged_bulk=averaged_bulk,
+        tet_barrier_bulk=bulk,
         node_rest_volume=node_volume,
         node_inverse_volume=1.0 / node_volume,
         node_bulk=node_bulk,
         averages_volume=bool(node_bulk.any()),
         surface_triangles=np.ascontiguousarray(surface),
         surface_rest_area=norm(area_vectors(mesh.points[surface]), axis=1),
+        surface_around=rise.node[open_triangles],
+        surface_rise=rise.weight[open_triangles],
         **supports,
         **foundations,
         **motion_fields(

@@ -8,6 +8,7 @@ from msdm_core.arithmetic import dot, eigh, log, matmul, norm
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
     QUADRATURE_COUNT,
+    QUADRATURE_RISE,
     QUADRATURE_WEIGHT,
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
@@ -31,17 +32,17 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     U = sum_e U_e + sum_t K'_t s V0_t ((J_t - s) - s ln(J_t / s)) + sum_h u_h . K_h u_h / 2 - sum_i m_i g . (x_i - X_i)
     with U_e the energy of a spring, a tet or an averaged volume without Maxwell arms (`element_energies`), if linear
     k (l - l0)^2 / 2, K_t V0_t (J_t - 1)^2 / 2 and K_a V0_a (J_a - 1)^2 / 2;
-    K'_t the averaged share of the modulus, its sum over tets below s = SQUEEZED_RATIO (infinite for a tet inside out);
+    K'_t the whole volume modulus of a tet, its sum over tets below s = SQUEEZED_RATIO (infinite for a tet inside out);
     u_h the displacement of a node on an elastic foundation. Contact with tools (`contact_energy`) and supports is not
     included.
     """
     elements = float(element_energies(model, element_strains(model, state.node_position)).sum())
     ratio = volume_ratios(model, state)
-    squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_averaged_bulk > 0.0))
+    squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_barrier_bulk > 0.0))
     share = np.maximum(ratio[squeezed], 0.0) / SQUEEZED_RATIO
     with np.errstate(divide="ignore"):
         barrier = SQUEEZED_RATIO * SQUEEZED_RATIO * ((share - 1.0) - log(share))
-    volume = float(matmul((model.tet_averaged_bulk * model.tet_rest_volume)[squeezed], barrier))
+    volume = float(matmul((model.tet_barrier_bulk * model.tet_rest_volume)[squeezed], barrier))
     lift = matmul(state.node_position - model.node_rest_position, model.gravity)
     ground = (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)
     moved = state.node_position[model.foundation_nodes] - (model.foundation_position + ground)
@@ -148,7 +149,8 @@ def contact_energy(model: OrganModel, state: OrganState, shapes: ContactShapes, 
     corners = state.node_position[model.surface_triangles]
     normal = area_vectors(corners)
     normal /= norm(normal, axis=1)[:, None]
-    points = matmul(QUADRATURE_BARYCENTRIC, corners)
+    rise = matmul(model.surface_rise.transpose(0, 2, 1), state.node_position[model.surface_around])
+    points = matmul(QUADRATURE_BARYCENTRIC, corners) + matmul(QUADRATURE_RISE, rise)
     energy = 0.0
     for shape, radius in enumerate(shapes.shape_radius):
         start, axis = shapes.shape_ends[shape, 0], np.diff(shapes.shape_ends[shape], axis=0)[0]

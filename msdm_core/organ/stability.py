@@ -55,8 +55,7 @@ def explicit_tissue(model: OrganModel) -> OrganModel:
         factor = factor * (1.0 + np.minimum(rise, STEEP_EXCESS))
         factor[:springs] *= np.maximum((1.0 + rise[:springs]) / HELD_TANGENT, 1.0)
     stiffness, bulk, node_bulk = np.split(factor * element_stiffness(model), [springs, springs + tets])
-    averaged_bulk = model.tet_averaged_bulk * factor[springs : springs + tets]
-    return model._replace(spring_stiffness=stiffness, tet_bulk=bulk, tet_averaged_bulk=averaged_bulk, node_bulk=node_bulk)
+    return model._replace(spring_stiffness=stiffness, tet_bulk=bulk, node_bulk=node_bulk)
 
 
 def steep_sweeps(tangent_cap: float) -> int:
@@ -325,7 +324,8 @@ def _node_stiffness(model: OrganModel) -> FloatArray:
     for end in range(2):
         np.add.at(block, model.spring_nodes[:, end], springs)
     corners = model.node_rest_position[model.tet_nodes]
-    modulus = (explicit.tet_bulk + explicit.tet_averaged_bulk) * model.tet_inverse_volume
+    averaged = model.tet_barrier_bulk - model.tet_bulk
+    modulus = (explicit.tet_bulk + averaged) * model.tet_inverse_volume
     for corner in range(4):
         p, q, r = (corners[:, (corner + turn) % 4] for turn in (1, 2, 3))
         gradient = np.cross(q - p, r - p) / 6.0

@@ -186,6 +186,7 @@ def _scene(organ: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
         material=patient.material,
         capsule=patient.capsule,
         damping=patient.damping,
+        stiffness_rule=patient.stiffness_rule,
         # A scan shows the organ under its weight: that is its rest, and lifting works against stiffness alone.
         gravity=(0.0, 0.0, 0.0),
         anchors=_anchors(mesh),

@@ -1,6 +1,6 @@
 """Reference solutions by quadratic elements of scikit-fem, a development dependency imported where it is used.
 
-Hexahedra for blocks; axisymmetric quadrilaterals for the press of a punch on a bonded layer.
+Hexahedra for blocks; tets on an organ's mesh; axisymmetric quadrilaterals for the press of a punch on a bonded layer.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import eigsh, spsolve
 
-from msdm_core.mesh import FloatArray
+from msdm_core.mesh import FloatArray, IntArray, TetMesh
 from surgsim_apps.validation.statics import solve_displacement
 
 MISSING = "scikit-fem is not installed (pip install 'surgsim[dev]')"
@@ -66,6 +66,30 @@ def solid_block(size: Size, cells: Cells, youngs_modulus: float, poisson_ratio: 
     mesh = MeshHex.init_tensor(*(np.linspace(0.0, length, count + 1) for length, count in zip(size, cells)))
     basis = Basis(mesh, ElementVector(ElementHex2()), intorder=4)
     return Elements.assembled(linear_elasticity(*lame_parameters(youngs_modulus, poisson_ratio)), basis)
+
+
+def tet_compliance(mesh: TetMesh, triangles: IntArray, youngs_modulus: float, poisson_ratio: float) -> FloatArray:
+    """Mean displacement per force along x, y, z [m/N] of triangles that bear it evenly, (3,), of a body held at y = 0.
+
+    Quadratic tets on the given mesh; `triangles` (n, 3) are of its surface.
+    """
+    from skfem import Basis, ElementTetP2, ElementVector, FacetBasis, LinearForm, MeshTet
+    from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+    tets = MeshTet(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.tets.T.astype(np.int64)))
+    basis = Basis(tets, ElementVector(ElementTetP2()), intorder=2)
+    body = Elements.assembled(linear_elasticity(*lame_parameters(youngs_modulus, poisson_ratio)), basis)
+    loaded = {tuple(nodes) for nodes in np.sort(triangles, axis=1).tolist()}
+    outer = tets.boundary_facets()
+    facets = [facet for facet in outer if tuple(sorted(tets.facets[:, facet].tolist())) in loaded]
+    face = FacetBasis(tets, basis.elem, facets=np.array(facets), intorder=2)
+    compliance = np.zeros(3)
+    for axis in range(3):
+        force = LinearForm(lambda v, w, axis=axis: v[axis]).assemble(face)
+        force /= force.sum()
+        displacement = solve_displacement(body.stiffness, np.flatnonzero(body.place[:, 1] < 1e-9), 0.0, force)
+        compliance[axis] = force @ displacement
+    return compliance
 
 
 def clamped_torsion(size: Size, cells: Cells, modulus: float, nu: float) -> float:

@@ -283,8 +283,8 @@ class OrganBlock:
         tension, slope = model.tet_bulk * (ratio - 1.0), model.tet_bulk.copy()
         squeezed = ratio < SQUEEZED_RATIO
         share = SQUEEZED_RATIO / ratio[squeezed]
-        tension[squeezed] += model.tet_averaged_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
-        slope[squeezed] += model.tet_averaged_bulk[squeezed] * share**2
+        tension[squeezed] += model.tet_barrier_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
+        slope[squeezed] += model.tet_barrier_bulk[squeezed] * share**2
         if model.node_bulk.any():
             node_volume = np.bincount(model.tet_nodes.ravel(), np.repeat(volume / 4.0, 4), len(position))
             node_tension = model.node_bulk * (node_volume / model.node_rest_volume - 1.0)

@@ -29,6 +29,7 @@ CASES: tuple[Case, ...] = (
     Case("fitted springs, torsion", bars.fitted_torsion, needs_fem=True),
     Case("fitted springs, cantilever", partial(bars.cantilever_case, "fitted"), needs_fem=True),
     Case("fitted springs, rod", partial(bars.rod_case, "fitted")),
+    Case("lobe, free corner", bars.lobe_corner, slow=True, needs_fem=True),
     Case("capsule, faces", capsule.faces),
     Case("capsule, curved", capsule.curved),
     Case("capsule, pulled", capsule.pulled),

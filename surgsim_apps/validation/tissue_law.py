@@ -248,7 +248,7 @@ def spring_and_volume_stiffness(spec: OrganSpec) -> tuple[csc_array, csc_array]:
     """Stiffness of an elastic organ's springs and of its volume terms [N/m], (3 n_node, 3 n_node)."""
     assert isinstance(spec.materials, Material)
     model = compile_organ(replace(spec, materials=replace(spec.materials, relaxation=None), gravity=(0.0, 0.0, 0.0)))
-    zeros = {name: np.zeros_like(getattr(model, name)) for name in ("tet_bulk", "tet_averaged_bulk", "node_bulk")}
+    zeros = {name: np.zeros_like(getattr(model, name)) for name in ("tet_bulk", "tet_barrier_bulk", "node_bulk")}
     springs = csc_array(assemble_stiffness(model._replace(**zeros, averages_volume=False)))
     return springs, csc_array(csc_array(assemble_stiffness(model)) - springs)
 

@@ -192,6 +192,8 @@ class Anatomy:
             anchors=self.anchors,
             foundations=self.foundations,
             damping=scene.damping,
+            # The nodes in the middle of a block's outer faces are light otherwise, and turn tets inside out first.
+            mass_scheme="barycentric" if scene.mesh.block is None else "voronoi",
             stiffness_rule=scene.stiffness_rule,
             gravity=scene.gravity,
             supports=scene.supports,

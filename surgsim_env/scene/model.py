@@ -700,7 +700,7 @@ class Scene:
         retract: ranges of a retraction's episodes.
         capsule: on the organ's boundary.
         demonstration: lesions of the scene file.
-        stiffness_rule: one of msdm_core.material.stiffness.STIFFNESS_RULES.
+        stiffness_rule: of the springs, "lloyd" or "fitted" (`msdm_core.material.stiffness.spring_network`).
         port: of an arm; None: that of `instruments.arm.arm_instrument.default_port`.
         ports: those of two arms, the left one's first.
         endoscope: camera of retractions.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msdm_core.arithmetic import cbrt, cos, norm, sin
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.material.regions import Capsule, Lesion
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Grasp, Instrument
 from surgsim_env.scene.anatomy import Anatomy
@@ -121,7 +121,7 @@ class RetractionDraw:
             capsule = Capsule(self.capsule_stiffness / CAPSULE_THICKNESS, CAPSULE_THICKNESS)
         specification = replace(
             plain,
-            mesh=TetMesh(mesh.points * self.scale, mesh.tets, mesh.region, mesh.region_names),
+            mesh=mesh.scaled(self.scale),
             materials=replace(anatomy.scene.material, youngs_modulus=self.youngs_modulus),
             capsule=capsule,
             anchors=held_nodes(mesh.points, anatomy.anchors, self.held_share),

@@ -65,11 +65,11 @@ def volume_forces(model: OrganModel, position: FloatArray, velocity: FloatArray)
     """
     force = np.zeros_like(position)
     tension = averaged_tension(model, position, velocity)
-    moduli = zip(model.tet_nodes, model.tet_rest_volume, model.tet_bulk, model.tet_averaged_bulk)
-    for nodes, rest_volume, bulk, averaged_bulk in moduli:
+    moduli = zip(model.tet_nodes, model.tet_rest_volume, model.tet_bulk, model.tet_barrier_bulk)
+    for nodes, rest_volume, bulk, barrier_bulk in moduli:
         volume, rate, gradient = tet_volume(position[nodes], velocity[nodes])
         strain = volume / rest_volume - 1.0 + model.beta * rate / rest_volume
-        squeezed = averaged_bulk * min(volume / rest_volume - 0.6, 0.0) * 0.6 / (volume / rest_volume)
+        squeezed = barrier_bulk * min(volume / rest_volume - 0.6, 0.0) * 0.6 / (volume / rest_volume)
         force[nodes] -= (bulk * strain + squeezed + tension[nodes].mean()) * gradient
     return force
 
@@ -109,7 +109,7 @@ def hold_squeezed(
     p' dt dJ/dt more tension at the rate of the step's end: dJ/dt = w (1 - x dt sum |dV/dx|^2 / m / V0), solved for x.
     """
     force = force.copy()
-    for nodes, rest_volume, bulk in zip(model.tet_nodes, model.tet_rest_volume, model.tet_averaged_bulk):
+    for nodes, rest_volume, bulk in zip(model.tet_nodes, model.tet_rest_volume, model.tet_barrier_bulk):
         volume, _, gradient = tet_volume(position[nodes], velocity[nodes])
         ratio = volume / rest_volume
         if ratio >= 0.6:
@@ -261,7 +261,7 @@ def without_stiffness(model: OrganModel) -> OrganModel:
     return model._replace(
         spring_stiffness=frozen(np.zeros_like(model.spring_stiffness)),
         tet_bulk=frozen(np.zeros_like(model.tet_bulk)),
-        tet_averaged_bulk=frozen(np.zeros_like(model.tet_averaged_bulk)),
+        tet_barrier_bulk=frozen(np.zeros_like(model.tet_barrier_bulk)),
         node_bulk=frozen(np.zeros_like(model.node_bulk)),
         averages_volume=False,
     )

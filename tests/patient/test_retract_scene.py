@@ -79,6 +79,7 @@ def test_it_is_the_same_organ_turned_by_what_the_file_says(folder, scene):
 def test_tissue_is_the_patient_s_and_lesions_are_part_of_it(folder, scene):
     patient = load_scene(folder / "patient.toml")
     assert (scene.material, scene.capsule) == (patient.material, patient.capsule)
+    assert scene.stiffness_rule == patient.stiffness_rule == "lloyd"
     assert [(region.name, region.material, region.lesion) for region in scene.regions] == [
         (region.name, region.material, False) for region in patient.regions
     ]

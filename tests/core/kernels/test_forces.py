@@ -52,7 +52,7 @@ def without_averages(model: OrganModel) -> OrganModel:
     """The same organ without the averaged volume term."""
     return model._replace(
         node_bulk=oracle.frozen(np.zeros_like(model.node_bulk)),
-        tet_averaged_bulk=oracle.frozen(np.zeros_like(model.tet_averaged_bulk)),
+        tet_barrier_bulk=oracle.frozen(np.zeros_like(model.tet_barrier_bulk)),
         averages_volume=False,
     )
 

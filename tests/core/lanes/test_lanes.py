@@ -56,7 +56,7 @@ def varied(base: OrganModel, seed: int) -> OrganModel:
         node_inverse_mass=oracle.frozen(base.node_inverse_mass / heavier),
         spring_stiffness=times(base.spring_stiffness, 0.5, 2.0),
         tet_bulk=times(base.tet_bulk, 0.0, 1.5),
-        tet_averaged_bulk=times(base.tet_averaged_bulk, 0.0, 2.0),
+        tet_barrier_bulk=times(base.tet_barrier_bulk, 0.0, 2.0),
         node_bulk=times(base.node_bulk, 0.0, 1.5),
     )
 
@@ -72,9 +72,9 @@ def pressed_organs(count: int = 8, *, damping: Damping = DAMPED) -> list[OrganMo
 
 # What is zero where one term is looked at.
 TERMS: dict[str, set[str]] = {
-    "springs": {"tet_bulk", "tet_averaged_bulk", "node_bulk"},
-    "volume of tets": {"spring_stiffness", "tet_averaged_bulk", "node_bulk"},
-    "averaged volume": {"spring_stiffness", "tet_bulk", "tet_averaged_bulk"},
+    "springs": {"tet_bulk", "tet_barrier_bulk", "node_bulk"},
+    "volume of tets": {"spring_stiffness", "tet_barrier_bulk", "node_bulk"},
+    "averaged volume": {"spring_stiffness", "tet_bulk", "tet_barrier_bulk"},
     "squeezed tets": {"spring_stiffness", "tet_bulk", "node_bulk"},
     "all": set(),
 }

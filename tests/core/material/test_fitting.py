@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.sparse import csr_array
 
+from msdm_core.errors import MeshError
 from msdm_core.material.fitting import (
     LARGEST_RESIDUAL,
     SINGLE_NODE_SHARE,
@@ -228,6 +229,20 @@ def test_a_lesion_needs_no_refit():
     assert uniaxial_modulus(mesh, once) > 1.05 * MODULUS
     assert uniaxial_modulus(mesh, once) == pytest.approx(uniaxial_modulus(mesh, anew), rel=0.008)
     assert clamped_torsion(mesh, once) == pytest.approx(clamped_torsion(mesh, anew), rel=0.008)
+
+
+def test_all_sizes_of_a_mesh_share_their_factors():
+    """Those of a fit to the scaled mesh itself, to rounding: f, F and the pull scale alike; of a bent mesh they differ."""
+    mesh = block(4)
+    scaled = mesh.scaled(0.94).scaled(2.0)
+    np.testing.assert_array_equal(scaled.points, 2.0 * (0.94 * mesh.points))
+    assert spring_fit(scaled) is spring_fit(mesh)
+    own = spring_fit(TetMesh(scaled.points, mesh.tets))
+    np.testing.assert_allclose(own.edge_factor, spring_fit(mesh).edge_factor, atol=1e-6)
+    longer = mesh.moved(mesh.points * [1.0, 1.0, 1.1])
+    assert np.abs(spring_fit(longer).edge_factor - spring_fit(mesh).edge_factor).max() > 0.01
+    with pytest.raises(MeshError):
+        mesh.scaled(-1.0)
 
 
 # ---- the fallback -----------------------------------------------------------------------------------------------

@@ -197,22 +197,24 @@ def _largest_leaves(permitted: Int64Array) -> Int64Array:
     return level
 
 
-def octree_tets(level: Int64Array) -> Int64Array:
+def octree_tets(level: Int64Array, *, face_nodes: bool = True) -> Int64Array:
     """Tets of a balanced octree, as grid points numbered row by row, not oriented, shape (n_tet, 4).
 
     Between leaves of one size lie BCC tets (two centres and an edge of the face), cut in two by a corner of smaller
     leaves on that edge. A large leaf meets four small ones in eight quarters of a BCC tet around the centre of its
-    face; the small ones meet it in half pyramids. Outer faces are cut from their centres: half BCC tets.
+    face; the small ones meet it in half pyramids. Outer faces are cut from their centres into half BCC tets, or without
+    nodes there into half pyramids.
 
     Args:
         level: from `balanced_levels`, shape (nx, ny, nz).
+        face_nodes: False for outer faces without nodes in their middle, but where a corner lies on an edge.
     """
     is_node = octree_nodes(level)
     tets = []
     for size in range(int(level.max()) + 1):
         centre = _leaf_centres(level, size)
         for axis, sign in product(range(3), (-1, 1)):
-            tets += _face_tets(centre, size, axis, sign, level, is_node)
+            tets += _face_tets(centre, size, axis, sign, level, is_node, face_nodes)
     places = np.moveaxis(np.concatenate(tets), -1, 0)
     return np.asarray(np.ravel_multi_index(tuple(places), is_node.shape), dtype=np.int64)
 
@@ -234,7 +236,13 @@ def _leaf_centres(level: Int64Array, size: int) -> Int64Array:
 
 
 def _face_tets(
-    centre: Int64Array, size: int, axis: int, sign: int, level: Int64Array, is_node: NDArray[np.bool_]
+    centre: Int64Array,
+    size: int,
+    axis: int,
+    sign: int,
+    level: Int64Array,
+    is_node: NDArray[np.bool_],
+    face_nodes: bool,
 ) -> list[Int64Array]:
     """Grid coordinates of the tets of leaves of one level at their faces on one side, each (n, 4, 3)."""
     half = 2**size
@@ -248,7 +256,7 @@ def _face_tets(
     outside = (beyond[:, axis] < 0) | (beyond[:, axis] >= level.shape[axis])
     other = np.where(outside, size + 1, level[tuple(np.where(outside[:, None], 0, beyond).T)])
     is_cut = np.stack([is_node[tuple((centre + (ring[k] + ring[(k + 1) % 4]) // 2).T)] for k in range(4)], axis=1)
-    fanned = (other < size) | outside
+    fanned = (other < size) | (outside & (face_nodes | is_cut.any(axis=1)))
     halved = (other > size) & ~fanned
     tets = [_half_pyramids(centre[halved], ring, half)]
     for k in range(4):
@@ -269,7 +277,7 @@ def _half_pyramids(centre: Int64Array, ring: Int64Array, half: int) -> Int64Arra
     """Two tets per leaf on one face, cut along the diagonal through the centre of a twice as large neighbour's face.
 
     Of the four corners, counted in leaf widths, that centre is odd along both directions of the face and its
-    opposite even along both.
+    opposite even along both; on outer faces the same rule alternates like a checkerboard.
     """
     varying = np.flatnonzero(np.ptp(ring, axis=0))
     odd = ((centre + ring[0])[:, varying] // (2 * half)).sum(axis=1) % 2

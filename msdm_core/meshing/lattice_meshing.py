@@ -24,7 +24,9 @@ TET_LIMIT = 2_000_000
 GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB while meshing
 
 
-def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float = 0.0) -> TetMesh:
+def box_mesh(
+    size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float = 0.0, face_nodes: bool = True
+) -> TetMesh:
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
     Nodes are the corners and centres of the cells and the centres of outer faces, along x, y and z in turn. Each inner
@@ -36,6 +38,8 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
         cells: whole numbers of cells along each axis, shape (3,).
         coarsening: largest cell edge over the smallest, 1 (cells of one size), 2 or 4; divides each number of cells.
         fine_depth: depth of the fine cells of a graded block below the top face z = sz [m].
+        face_nodes: False for outer faces of two triangles, whose diagonals alternate like a checkerboard: a longer
+            stable step, and for a tip a coarser and less even surface.
 
     Warns:
         UserWarning: cells more than 1 % from cubes: formula (6) is then not isotropic; names the stretch.
@@ -57,7 +61,7 @@ def box_mesh(size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_dep
     # Rounding must not add a layer to a depth of whole layers.
     fine_layers = int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
     permitted[:, :, counts[2] - fine_layers :] = 0
-    used, renumbered = np.unique(octree_tets(balanced_levels(permitted)), return_inverse=True)
+    used, renumbered = np.unique(octree_tets(balanced_levels(permitted), face_nodes=face_nodes), return_inverse=True)
     places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
     return _swept_mesh(places / (2 * counts) * lengths, renumbered.reshape(-1, 4))
 

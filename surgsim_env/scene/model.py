@@ -42,10 +42,14 @@ def _require_range(entry: str, bounds: Range) -> None:
 
 @dataclass(frozen=True)
 class BlockMesh:
-    """A block on a cubic lattice (`box_mesh`): size [m], and cells along x, y, z."""
+    """A block on a cubic lattice (`box_mesh`): size [m], and cells along x, y, z.
+
+    Without face_nodes its outer faces have no node in their middle.
+    """
 
     size: Vector
     cells: tuple[int, int, int]
+    face_nodes: bool = True
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,9 @@ ROW_TOOL, ROW_GIVE, ROW_MORE, ROW_STEP = 20, 24, 26, 30
 ROW_WIDTH = 34
 # A row of `contact_places`: shape, number of the point, nodes of its corners.
 PLACE_WIDTH = 5
-# Factors of the sweeps of `hold_contact`, see there.
-SWEEPS = (1.0, 2.0, 2.0)
+# Factors of the sweeps of `hold_contact`, see there: small rising factors act on the stiffest motions first. With them a
+# hold of 50 limits the step by a quarter at most (`stability.contact_excess`).
+SWEEPS = (1.0, 1.2, 1.5, 2.5, 6.0)
 
 
 @njit(**INLINED)
@@ -454,7 +455,7 @@ def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wre
 
     `add_contact_forces` has applied k_p g and k_t u. The pressure at the end is larger by q = (k_p dt + c_p) g', the
     friction by k_t dt u', with the rates g', u' of the velocities after all forces. Sweeps over the points approach it:
-    each adds w (q - the sum so far) / (1 + h), w = 1, 2, 2 (`SWEEPS`), and all points read the forces after the
+    each adds w (q - the sum so far) / (1 + h), with w of `SWEEPS`, and all points read the forces after the
     previous sweep, so that their order does not matter. h is the mean over the corners of H_a / m_a, with
     H_a = dt sum (k_p dt + c_p) A |dg/dx_a| sum_b |dg/dx_b| over the points around a node (or, if larger, k_t dt A times
     its weight): a point's share of a node's mass is its share of the node's hold (mass splitting, Tonge, Benevolenski

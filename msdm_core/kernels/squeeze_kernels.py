@@ -17,6 +17,7 @@ from msdm_core.kernels.layout_kernels import (
     group_width,
     load_column,
     load_item,
+    load_shared,
     set_node,
     store_column,
     take_from_node,
@@ -34,18 +35,22 @@ from msdm_core.kernels.space_kernels import (
 )
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
-# Implicit stiffness of a steep spring over the rise of its tangent: a larger factor needs fewer sweeps for the fast
-# motions, and makes the slow motions heavier. Measured on bars of springs with 60 times the tangent at rest: 8, 12 and
-# 16 sweeps are stable up to 29, 38 and 49 times that tangent at the step of the linear organ; a factor of 1 needs twice
-# as many sweeps.
-STEEP_HOLD = 3.0
-VOLUME_HOLD = 0.35
+# Implicit stiffness of a steep spring over the rise of its tangent, and the share of it that acts on the speed, as a
+# drag; the other part acts on the change of speed, as a mass. Shares of its energy that a block of liver's law,
+# stretched by 12 %, keeps after 0.1 s: 0.41 with 3 and 1 (all drag), 0.77 with 3 and 0.1, 0.88 with 1 and 0.08, 0.94
+# with 1 and 0.05. Without drag energy grows without bound, since the added mass varies with the strain; with 0.05 no
+# block, noisy, squeezed, sheared or swollen, exceeds 1.06 times its start at the shipped step.
+STEEP_HOLD, STEEP_DRAG = 1.0, 0.05
+# Springs hold the rise of the volume term too: in a uniform expansion e springs have an energy of 15 mu e^2 / 2, and the
+# volume term of 9 K_t e^2 / 2, so that springs stiffer by this times K_t / mu bound it.
+VOLUME_HOLD = 0.6
 # Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
 # ends' speeds by a pull of 1 N, and its pull so far.
 STEEP_WIDTH = 6
-# Sweeps per tangent over that at rest, and the fewest. Measured on bars with all springs beyond the cap strain
-# (stretched by 30 %, compressed by 15 %, sheared by 40 %, slowly or at once, and released): the step at rest is stable
-# up to tangents of 14, 20, 29 and 38 times that at rest with 4, 6, 8 and 12 sweeps.
+# Sweeps per tangent over that at rest, and the fewest. Measured on a bar with all springs beyond the cap strain, by the
+# spectral radius of a step: stretched by 30 %, the step at rest is stable up to tangents of 24, 44, 60 and 100 times
+# that at rest with 4, 6, 8 and 12 sweeps, compressed by 15 % up to 44 and 75 with 4 and 6. Blocks of liver's law,
+# stretched by 30 %, sheared by 40 % or compressed by 15 % at once and released, gain no energy at 0.95 of the step.
 SWEEPS_PER_TANGENT = 1.0 / 3.0
 SWEEPS_LEAST = 4
 
@@ -121,23 +126,25 @@ def _direction(lanes, rows, row):
 
 @njit(**INLINED)
 def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
-    """Set the speed of a node after all forces so far."""
+    """Set the change of a node's speed by all forces so far, plus STEEP_DRAG of its speed."""
     rate = dt * load_item(lanes, inverse_mass, node)
-    set_node(lanes, speed, node, shifted(at_node(lanes, velocity, node), rate, at_node(lanes, force, node)))
+    dragged = times(STEEP_DRAG, at_node(lanes, velocity, node))
+    set_node(lanes, speed, node, shifted(dragged, rate, at_node(lanes, force, node)))
 
 
 @njit(**KERNEL)
 def hold_steep(lanes, model, state, count, sweeps_least, dt):
-    """Implicit rise of the tangent of steep springs: tension T + dt K dl/dt at the step's end.
+    """Implicit rise of the tangent of steep springs: tension T + dt K dw/dt, w = v+ - (1 - d) v at both ends.
 
-    K = STEEP_HOLD k q (1 + sum g_i), with q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy over
-    its springs is nowhere above that of springs with q alone, which would limit the step. The tissue kernel has applied
-    T. For the springs with q above STEEP_EXCESS this kernel solves for the remainder, p = dt K d(l)/dt with the speeds
-    at the end of the step, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
-    in order and in reverse in turn, from p = 0. After each pair of sweeps the result is that of symplectic Euler with
-    larger masses, M <= M' <= M + dt^2 K, symmetric, so that no energy is made; the error of the sweeps is smallest in
-    the fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A
-    spring at rest gets no force, so the static equilibrium does not depend on dt.
+    K = h q (1 + sum g_i) with the model's `spring_hold` h and q the mean of (c - 1) v^2 of both ends: the tangent of a
+    node's energy over springs and volumes is nowhere above that of linear ones times 1 + q, which would limit the step;
+    d = STEEP_DRAG. The tissue kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves for the
+    remainder, p = dt K times the rate of length by w, from the masses of their nodes and all forces so far: Gauss-Seidel
+    sweeps over the springs, in order and in reverse in turn, from p = 0. After each pair of sweeps
+    M' (v+ - v) = dt f - d (M' - M) v: symplectic Euler with larger masses, M <= M' <= M + dt^2 K, symmetric, and a drag
+    that outweighs what these take from or give to the motion as they change. The error of the sweeps is smallest in the
+    fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A spring
+    at rest gets no force, so the static equilibrium does not depend on dt.
 
     In:  count: entries of `steep_springs`, each the first of `group_width` successive springs with a steep spring,
          sweeps_least: an even number as `steep_sweeps` of the model, dt [s]
@@ -163,6 +170,8 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             along = divided(along, spring_length(along))
             # Each of several organs side by side has its own steep springs.
             tangent = keep_lower(none + STEEP_EXCESS, more, load_item(lanes, hold, spring) * more, none)
+            if model.relaxes:
+                tangent = tangent * load_shared(lanes, steepness, model.element_gain, spring)
             give = dt * load_item(lanes, inverse_mass, i) + dt * load_item(lanes, inverse_mass, j)
             places[held] = spring
             store_column(lanes, rows, STEEP_WIDTH, held, 0, along[0])

@@ -152,7 +152,7 @@ SCRATCH_FIELDS = (
     _field("steep_springs", "", "n_steep", "shared", "groups of springs with any steep", "int32"),
     _field("steep_places", "", "n_steep", "shared", "steep springs, see squeeze_kernels", "int32"),
     _field("steep_rows", "", "n_steep steep_width", "own", "likewise"),
-    _field("steep_speed", "m/s", "n_soft 3", "own", "speed of their nodes after all forces"),
+    _field("steep_speed", "m/s", "n_soft 3", "own", "change of speed of their nodes, see there"),
     _field("contact_candidates", "", "n_shape n_surface", "rows", "triangles in reach, shape by shape", "int32"),
     _field("contact_rows", "", "n_row row_width", "turns", "a row for each point in contact"),
     _field("contact_places", "", "n_row place_width", "turns", "shape, point and nodes of each row", "int32"),

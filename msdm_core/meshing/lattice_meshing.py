@@ -45,9 +45,9 @@ def box_mesh(
         UserWarning: cells more than 1 % from cubes: formula (6) is then not isotropic; names the stretch.
 
     Raises:
-        ValueError: a size or count that is not positive, or too many cells; names it.
+        ValueError: a size or count that is not positive, a coarsening out of range, or too many cells; names it.
     """
-    lengths, counts = _checked_box(size, cells)
+    lengths, counts = _checked_box(size, cells, coarsening)
     edges = lengths / counts
     stretch = edges.max() / edges.min()
     if stretch > STRETCH_LIMIT:
@@ -66,12 +66,14 @@ def box_mesh(
     return _swept_mesh(places / (2 * counts) * lengths, renumbered.reshape(-1, 4))
 
 
-def _checked_box(size: ArrayLike, cells: ArrayLike) -> tuple[FloatArray, Int64Array]:
+def _checked_box(size: ArrayLike, cells: ArrayLike, coarsening: int) -> tuple[FloatArray, Int64Array]:
     lengths, counts = np.asarray(size, dtype=np.float64), np.asarray(cells)
     if not (lengths > 0.0).all():
         raise ValueError(f"size is {lengths.tolist()}; the rule is three positive lengths in metres")
     if not ((counts >= 1) & (counts == np.floor(counts))).all():
         raise ValueError(f"cells is {counts.tolist()}; the rule is three whole numbers of at least 1")
+    if coarsening not in COARSENINGS or (counts % coarsening != 0).any():
+        raise ValueError(f"coarsening is {coarsening}; the rule is 1, 2 or 4, and a divisor of cells {counts.tolist()}")
     if TETS_PER_CELL * float(np.prod(counts.astype(np.float64))) > TET_LIMIT:
         raise ValueError(f"cells is {counts.tolist()}; that is more than {TET_LIMIT} tets: choose fewer cells")
     return lengths, counts.astype(np.int64)

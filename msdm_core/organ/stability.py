@@ -153,7 +153,7 @@ def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> tuple[flo
 
 
 def contact_excess(hold: float, share: float = 1.0) -> float:
-    """Part of the hold h of implicit contact that still limits the explicit step, of the limit 4; 0 for h <= 7.
+    """Part of the hold h of implicit contact that still limits the explicit step, of the limit 4; 0 for h <= 20.
 
     Stiffness is over mass and times dt^2 here. A motion with the hold k <= h gets the force of its stiffness, a share
     of k, at the start of the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k) of
@@ -163,7 +163,10 @@ def contact_excess(hold: float, share: float = 1.0) -> float:
     """
     held = hold * np.linspace(0.0, 1.0, 1001)
     left = np.prod([1.0 - factor * (1.0 + held) / (1.0 + hold) for factor in SWEEPS], axis=0)
-    return max(0.0, float((share * held - 2.0 * ((1.0 + held) / (1.0 + held * left) - 1.0)).max()))
+    slowed = 1.0 + held * left
+    if not (slowed > 0.0).all():
+        return math.inf
+    return max(0.0, float((share * held - 2.0 * ((1.0 + held) / slowed - 1.0)).max()))
 
 
 def step_limit(omega: float, alpha: float, beta: float, drag_rate: float = 0.0) -> float:
@@ -189,7 +192,7 @@ def stable_dt(model: OrganModel, contact: ContactLaw | None = None) -> float:
     Supports hold and drag each node with `support_hold`. Contact is implicit, with its damping and its friction, and
     takes `contact_excess` of the limit 2 (1 + e^(-alpha dt)) at most; the organ takes at most (dt / stable_step)^n of
     it (n = 2, with beta or damped supports 1). The implicit guard of the shapes' axes takes nothing; beta damps the
-    organ alone. The organ is linearised at rest: stretched by 20 % it is stable up to 0.92 to 0.96 of this step.
+    organ alone. The organ is linearised at rest.
     """
     own = model.stable_step
     if contact is None or not math.isfinite(own) or not np.any(model.node_inverse_mass):

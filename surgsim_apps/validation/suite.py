@@ -36,6 +36,8 @@ CASES: tuple[Case, ...] = (
     Case("damping rate", bars.damping_case),
     Case("stable step", dynamics.stable_step),
     Case("energy", dynamics.energy_drift),
+    Case("energy, stretched", dynamics.stretched_energy),
+    Case("stable step, stretched", dynamics.strained_step, slow=True),
     Case("passivity, bounces", partial(dynamics.bounces, ((0.005, 0.0005),))),
     Case("passivity, more bounces", partial(dynamics.bounces, dynamics.OTHER_FALLS), slow=True),
     Case("passivity, presses", partial(dynamics.presses, 100)),

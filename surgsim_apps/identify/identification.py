@@ -152,7 +152,7 @@ class Identification:
         strain_supported: largest equivalent strain that the model's tissue reaches at half of the fitted sites or more;
             0 for linear tissue
         curve, linear_curve: presses of the identified and of the linear shape
-        relaxation: arms by held presses, with the relative moduli of the springs
+        relaxation: arms by held presses
         other_ratios: error on the training sites and factor on the modulus for other Poisson's ratios
         warnings: limits of the data and of the identification, a sentence each
         seconds: wall time
@@ -257,8 +257,6 @@ def identify(
             # Arms also act while the ball moves: the second search uses forces without them.
             samples = _without_arms(samples, curve, relaxation)
         other_ratios = _other_ratios(library, shape, curve, training, advance_by_one)
-        if relaxation is not None:
-            relaxation = _of_springs(library, shape, curve, relaxation)
     sets = []
     for recording, (_, left_out), part, others, (trained, _) in zip(recordings, sorted_sets, samples, held_out, halves):
         is_training = np.isin(np.arange(len(part)), trained)
@@ -350,31 +348,6 @@ def _other_ratios(
     return results
 
 
-def _of_springs(
-    library: PressLibrary, shape: PressShape, curve: SampledCurve, relaxation: RelaxationFit
-) -> RelaxationFit:
-    """Relative moduli of the springs from those of the force, of which the elastic volume term bears a part.
-
-    Springs gamma times as stiff with the same volume term raise the force gamma^p times; p from a press.
-    """
-    gain = 1.0 + math.fsum(relaxation.relative_moduli)
-    if gain == 1.0:
-        return relaxation
-    nu = library.setting.poisson_ratio
-    # Volume over spring modulus, (4 nu - 1) / (2.5 (1 - 2 nu)), divided by gamma gives nu with stiffer springs.
-    ratio = (4.0 * nu - 1.0) / (2.5 * (1.0 - 2.0 * nu)) / gain
-    stiffer = (2.5 * ratio + 1.0) / (4.0 + 5.0 * ratio)
-    (press,) = replace(library, setting=replace(library.setting, poisson_ratio=stiffer)).press([shape])
-    if not isinstance(press, PressCurve):
-        return relaxation
-    depths = np.linspace(0.4, 0.8, 9) * library.setting.depth
-    modulus = gain * (1.0 + stiffer) / (1.0 + nu)
-    force = float(np.median(modulus * library.sampled(press).at(depths) / curve.at(depths)))
-    power = math.log(force) / math.log(gain)
-    share = (gain ** (1.0 / power) - 1.0) / (gain - 1.0)
-    return replace(relaxation, relative_moduli=tuple(share * modulus for modulus in relaxation.relative_moduli))
-
-
 def _warnings(result: Identification, library: PressLibrary) -> list[str]:
     """Limits of the data and of the identification, a sentence each."""
     warnings = []
@@ -412,7 +385,7 @@ def _warnings(result: Identification, library: PressLibrary) -> list[str]:
     for dataset in result.sets:
         for reason, sites in dataset.left_out.items():
             kept_in = dataset.kept_in.get(reason)
-            error = f"with them kept in, {kept_in.median:.1%}" if kept_in else "no force of theirs is above 0"
+            error = f"with them kept in, {kept_in.median:.1%}" if kept_in else "none of their deeper forces is above 0"
             warnings.append(
                 f"{dataset.recording.name}, left out: {len(sites)} of {len(dataset.recording.presses)} sites "
                 f"({reason}); {error}: sites {_listed(sites)}"

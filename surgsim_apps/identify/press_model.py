@@ -25,6 +25,7 @@ from msdm_core.organ import (
     stable_dt,
     tissue_load,
 )
+from msdm_core.organ.stability import scale_mass
 
 # Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], without influence on a static press.
 MODULUS, DENSITY = 1000.0, 1000.0
@@ -35,6 +36,8 @@ CONTACT_STIFFNESS = 6e4
 CELLS_TO_RADIUS, HALF_WIDTH, FINE_DEPTH = 4, 2.75, 1.5
 # Depths of held presses, denser for small contacts.
 KNOT_COUNT, KNOT_POWER = 18, 1.4
+# Stable step over that of the block's own masses, by some per cent of mass added: no influence on a static press.
+STEP_GAIN = 1.5
 # Substep over the stable step at rest; a deeply pressed organ is stiffer.
 STEP_SHARE = 0.8
 # Durations in slow periods of the block: of the move to the next depth and of the hold; share of it for the reading.
@@ -164,7 +167,7 @@ def _block(shape: PressShape, setting: PressSetting, cells_to_radius: float) -> 
             damping=Damping(alpha=0.0),
         )
     )
-    return model, np.array([0.5 * size[0], 0.5 * size[1], size[2]])
+    return scale_mass(model, STEP_GAIN * model.stable_step), np.array([0.5 * size[0], 0.5 * size[1], size[2]])
 
 
 def _even_mass(model: OrganModel, law: ContactLaw, top: FloatArray, setting: PressSetting) -> OrganModel:

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from surgsim_apps.cli.main import main
-from surgsim_apps.identify import identification, shape_search
+from surgsim_apps.identify import shape_search
 from surgsim_apps.identify.identification import IdentifyOptions, identify
 from surgsim_apps.identify.press_model import PressShape
 from surgsim_apps.identify.recordings import Recording, SitePress
@@ -164,10 +164,8 @@ def test_bad_sites_are_named(stiffening_set):
         identify([Recording("few", (*stiffening_set.presses[:5], flat))], KNOWN)
 
 
-def test_held_presses_give_arms_and_the_law_at_equilibrium(monkeypatch):
+def test_held_presses_give_arms_and_the_law_at_equilibrium():
     arms = Arms((0.3, 0.5), (0.5, 6.0))
-    # The stand-in does not know springs from the volume term.
-    monkeypatch.setattr(identification, "_of_springs", lambda library, shape, curve, relaxation: relaxation)
     held = recording(tissue, count=16, samples=40, time=TIME, arms=arms, noise=0.005)
     result = identify([held], KNOWN)
     assert result.relaxation is not None

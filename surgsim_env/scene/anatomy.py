@@ -416,13 +416,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
     source = scene.mesh
     if source.block is not None:
         block = source.block
-        return box_mesh(
-            block.size,
-            block.cells,
-            coarsening=block.coarsening,
-            fine_depth=block.fine_depth,
-            face_nodes=block.face_nodes,
-        )
+        return box_mesh(block.size, block.cells, face_nodes=block.face_nodes)
     # Imports meshio and trimesh, so only for scenes with files.
     from msdm_core.mesh_files.mesh_io import read_mesh
     from msdm_core.mesh_files.surface_io import read_surface

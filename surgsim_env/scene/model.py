@@ -44,14 +44,11 @@ def _require_range(entry: str, bounds: Range) -> None:
 class BlockMesh:
     """A block on a cubic lattice (`box_mesh`): size [m], and cells along x, y, z.
 
-    With a coarsening of 2 or 4 only cells down to fine_depth [m] below the top keep that size. Without face_nodes its
-    outer faces have no node in their middle.
+    Without face_nodes its outer faces have no node in their middle.
     """
 
     size: Vector
     cells: tuple[int, int, int]
-    coarsening: int = 1
-    fine_depth: float = 0.0
     face_nodes: bool = True
 
 

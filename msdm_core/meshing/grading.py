@@ -197,24 +197,24 @@ def _largest_leaves(permitted: Int64Array) -> Int64Array:
     return level
 
 
-def octree_tets(level: Int64Array, *, face_nodes: bool = True) -> Int64Array:
+def octree_tets(level: Int64Array, *, top_nodes: bool = False) -> Int64Array:
     """Tets of a balanced octree, as grid points numbered row by row, not oriented, shape (n_tet, 4).
 
     Between leaves of one size lie BCC tets (two centres and an edge of the face), cut in two by a corner of smaller
     leaves on that edge. A large leaf meets four small ones in eight quarters of a BCC tet around the centre of its
-    face; the small ones meet it in half pyramids. Outer faces are cut from their centres into half BCC tets, or without
-    nodes there into half pyramids.
+    face; the small ones meet it in half pyramids, as they do the outside. An outer face with a corner on an edge is
+    cut from its centre.
 
     Args:
         level: from `balanced_levels`, shape (nx, ny, nz).
-        face_nodes: False for outer faces without nodes in their middle, but where a corner lies on an edge.
+        top_nodes: True for all outer faces at the end of the third axis cut from their centres, into half BCC tets.
     """
     is_node = octree_nodes(level)
     tets = []
     for size in range(int(level.max()) + 1):
         centre = _leaf_centres(level, size)
         for axis, sign in product(range(3), (-1, 1)):
-            tets += _face_tets(centre, size, axis, sign, level, is_node, face_nodes)
+            tets += _face_tets(centre, size, axis, sign, level, is_node, top_nodes)
     places = np.moveaxis(np.concatenate(tets), -1, 0)
     return np.asarray(np.ravel_multi_index(tuple(places), is_node.shape), dtype=np.int64)
 
@@ -242,7 +242,7 @@ def _face_tets(
     sign: int,
     level: Int64Array,
     is_node: NDArray[np.bool_],
-    face_nodes: bool,
+    top_nodes: bool,
 ) -> list[Int64Array]:
     """Grid coordinates of the tets of leaves of one level at their faces on one side, each (n, 4, 3)."""
     half = 2**size
@@ -256,7 +256,7 @@ def _face_tets(
     outside = (beyond[:, axis] < 0) | (beyond[:, axis] >= level.shape[axis])
     other = np.where(outside, size + 1, level[tuple(np.where(outside[:, None], 0, beyond).T)])
     is_cut = np.stack([is_node[tuple((centre + (ring[k] + ring[(k + 1) % 4]) // 2).T)] for k in range(4)], axis=1)
-    fanned = (other < size) | (outside & (face_nodes | is_cut.any(axis=1)))
+    fanned = (other < size) | (outside & ((top_nodes and axis == 2 and sign > 0) | is_cut.any(axis=1)))
     halved = (other > size) & ~fanned
     tets = [_half_pyramids(centre[halved], ring, half)]
     for k in range(4):

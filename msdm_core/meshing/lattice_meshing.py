@@ -25,21 +25,21 @@ GRID_LIMIT = 200_000_000  # half cells in the box around a surface: about 1 GB w
 
 
 def box_mesh(
-    size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float = 0.0, face_nodes: bool = True
+    size: ArrayLike, cells: ArrayLike, *, coarsening: int = 1, fine_depth: float = 0.0, top_nodes: bool = True
 ) -> TetMesh:
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
-    Nodes are the corners and centres of the cells and the centres of outer faces, along x, y and z in turn. Each inner
-    face of a cell gives four tets (two centres and an edge of the face), an outer face four of half their volume: its
-    triangles prefer no direction, and all its corners and all its centres yield alike.
+    Nodes are the corners and centres of the cells, along x, y and z in turn. Each inner face of a cell gives four tets
+    (two centres and an edge of the face), an outer face two. The diagonals of outer faces alternate like a checkerboard,
+    so that the block prefers no direction; the top face, where a tip presses, has nodes in the middle of its squares
+    instead, so that all of it yields alike.
 
     Args:
         size: edge lengths [m], shape (3,).
         cells: whole numbers of cells along each axis, shape (3,).
         coarsening: largest cell edge over the smallest, 1 (cells of one size), 2 or 4; divides each number of cells.
         fine_depth: depth of the fine cells of a graded block below the top face z = sz [m].
-        face_nodes: False for outer faces of two triangles, whose diagonals alternate like a checkerboard: a longer
-            stable step, and for a tip a coarser and less even surface.
+        top_nodes: False for a top face like the other ones, for a longer stable step.
 
     Warns:
         UserWarning: cells more than 1 % from cubes: formula (6) is then not isotropic; names the stretch.
@@ -61,7 +61,7 @@ def box_mesh(
     # Rounding must not add a layer to a depth of whole layers.
     fine_layers = int(np.ceil(fine_depth / lengths[2] * counts[2] * (1 - 1e-12)))
     permitted[:, :, counts[2] - fine_layers :] = 0
-    used, renumbered = np.unique(octree_tets(balanced_levels(permitted), face_nodes=face_nodes), return_inverse=True)
+    used, renumbered = np.unique(octree_tets(balanced_levels(permitted), top_nodes=top_nodes), return_inverse=True)
     places = np.stack(np.unravel_index(used, tuple(2 * counts + 1)), axis=1)
     return _swept_mesh(places / (2 * counts) * lengths, renumbered.reshape(-1, 4))
 

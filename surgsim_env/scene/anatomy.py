@@ -192,8 +192,8 @@ class Anatomy:
             anchors=self.anchors,
             foundations=self.foundations,
             damping=scene.damping,
-            # Nodes in the middle of a block's outer faces are light otherwise, and turn tets inside out first.
-            mass_scheme="voronoi" if scene.mesh.block is not None and scene.mesh.block.face_nodes else "barycentric",
+            # Nodes in the middle of a block's top faces are light otherwise, and turn tets inside out first.
+            mass_scheme="voronoi" if scene.mesh.block is not None and scene.mesh.block.top_nodes else "barycentric",
             stiffness_rule=scene.stiffness_rule,
             gravity=scene.gravity,
             supports=scene.supports,
@@ -416,7 +416,7 @@ def _load_mesh(scene: Scene) -> TetMesh:
     source = scene.mesh
     if source.block is not None:
         block = source.block
-        return box_mesh(block.size, block.cells, face_nodes=block.face_nodes)
+        return box_mesh(block.size, block.cells, top_nodes=block.top_nodes)
     # Imports meshio and trimesh, so only for scenes with files.
     from msdm_core.mesh_files.mesh_io import read_mesh
     from msdm_core.mesh_files.surface_io import read_surface

@@ -44,12 +44,12 @@ def _require_range(entry: str, bounds: Range) -> None:
 class BlockMesh:
     """A block on a cubic lattice (`box_mesh`): size [m], and cells along x, y, z.
 
-    Without face_nodes its outer faces have no node in their middle.
+    Without top_nodes the squares of its top face z = size[2] have no node in their middle.
     """
 
     size: Vector
     cells: tuple[int, int, int]
-    face_nodes: bool = True
+    top_nodes: bool = True
 
 
 @dataclass(frozen=True)

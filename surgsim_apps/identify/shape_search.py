@@ -24,7 +24,7 @@ THICKNESS_RADII = (1.2, 4.5)
 ONSET_RANGE, WIDTH_RANGE, CAP_RANGE = (0.0, 0.2), (0.05, 0.25), (2.0, 80.0)
 # Least thickness over the largest depth of a press with a law, and of linear tissue, whose presses succeed in thinner
 # tissue: thickness is all that makes it stiffen, and the law is compared with the best.
-DEPTH_SHARE, DEPTH_SHARE_LINEAR = 1.7, 1.2
+DEPTH_SHARE, DEPTH_SHARE_LINEAR = 1.7, 1.3
 # Presses spread over all four; over the law alone, for a given thickness; linear presses.
 SPREAD_COUNT, SPREAD_COUNT_LAW, LINEAR_COUNT = 56, 32, 8
 # Thicknesses between the linear presses at which their interpolation is compared.

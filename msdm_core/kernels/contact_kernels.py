@@ -55,8 +55,8 @@ ROW_TOOL, ROW_GIVE, ROW_MORE, ROW_STEP = 20, 24, 26, 30
 ROW_WIDTH = 34
 # A row of `contact_places`: shape, number of the point, nodes of its corners.
 PLACE_WIDTH = 5
-# Factors of the sweeps of `hold_contact`, see there: small rising factors act on the stiffest motions first. With them a
-# hold of 50 limits the step by a quarter at most (`stability.contact_excess`).
+# Factors of the sweeps of `hold_contact`, see there; small ones first, for the stiffest motions. With them a hold of 50
+# takes less than a quarter of the step's limit (`stability.contact_excess`).
 SWEEPS = (1.0, 1.2, 1.5, 2.5, 6.0)
 
 

@@ -10,9 +10,9 @@ from msdm_core.kernels.option_kernels import INLINED, INLINED_KERNEL
 from msdm_core.kernels.space_kernels import scalar_product, vector_product
 from msdm_core.kernels.vector_kernels import any_below, below_zero, root
 
-# Below this volume ratio s a tet also has a barrier pressure of its whole volume modulus K': a finite energy at J = 0 lets
-# single tets collapse between swollen neighbours. Its energy K' s V0 ((J - s) - s ln(J / s)) is unbounded at J = 0. With
-# a linear term instead, tets inverted at 50 to 80 % of the force.
+# Below this volume ratio s a tet also has a barrier pressure of its whole volume modulus K': with a finite energy at
+# J = 0 single tets collapse between swollen neighbours. The barrier's energy K' s V0 ((J - s) - s ln(J / s)) is
+# unbounded there. With a linear term instead, tets inverted at 50 to 80 % of the force.
 SQUEEZED_RATIO = 0.6
 # Rise of a spring's tangent over that at rest above which the spring is steep: its rise is then integrated implicitly.
 # A smaller rise counts in `stability.stable_dt`.

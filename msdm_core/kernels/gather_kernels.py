@@ -268,6 +268,6 @@ pair_sums = _define_read(4, 2, types.UniTuple(VECTOR, 3), _pair_sums)
 push_corners = _define_add(4, 4, _push_corners)
 # A vector added to the numbers of all corners.
 add_at_corners = _define_add(4, 1, _add_at_corners)
-# A vector added to the first numbers of all corners' pairs, others to the second numbers at the ends of the tet's spring
-# and at its other corners.
+# A vector added to the first numbers of all corners' pairs, others to the second numbers at the ends of the tet's
+# spring and at its other corners.
 add_pairs = _define_add(4, 2, _add_pairs)

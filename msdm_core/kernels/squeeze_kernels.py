@@ -36,13 +36,12 @@ from msdm_core.kernels.space_kernels import (
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 # Implicit stiffness of a steep spring over the rise of its tangent, and the share of it that acts on the speed, as a
-# drag; the other part acts on the change of speed, as a mass. Shares of its energy that a block of liver's law,
-# stretched by 12 %, keeps after 0.1 s: 0.41 with 3 and 1 (all drag), 0.77 with 3 and 0.1, 0.88 with 1 and 0.08, 0.94
-# with 1 and 0.05. Without drag energy grows without bound, since the added mass varies with the strain; with 0.05 no
-# block, noisy, squeezed, sheared or swollen, exceeds 1.06 times its start at the shipped step.
+# drag; the other part acts on the change of speed, as a mass. Shares of its energy that a free block of stiffening
+# tissue, stretched by 12 %, keeps after 0.1 s at 0.9 of the stable step: 0.27 with 3 and 1 (all drag), 0.87 with 1 and
+# 0.05. With less drag energy grows, since the added mass varies with the strain: to 2.0 times its start with 0.02.
 STEEP_HOLD, STEEP_DRAG = 1.0, 0.05
-# Springs hold the rise of the volume term too: in a uniform expansion e springs have an energy of 15 mu e^2 / 2, and the
-# volume term of 9 K_t e^2 / 2, so that springs stiffer by this times K_t / mu bound it.
+# Springs hold the rise of the volume term too: in a uniform expansion e springs have an energy of 15 mu e^2 / 2, and
+# the volume term of 9 K_t e^2 / 2, so that springs stiffer by this times K_t / mu bound it.
 VOLUME_HOLD = 0.6
 # Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
 # ends' speeds by a pull of 1 N, and its pull so far.
@@ -137,14 +136,14 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
     """Implicit rise of the tangent of steep springs: tension T + dt K dw/dt, w = v+ - (1 - d) v at both ends.
 
     K = h q (1 + sum g_i) with the model's `spring_hold` h and q the mean of (c - 1) v^2 of both ends: the tangent of a
-    node's energy over springs and volumes is nowhere above that of linear ones times 1 + q, which would limit the step;
-    d = STEEP_DRAG. The tissue kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves for the
-    remainder, p = dt K times the rate of length by w, from the masses of their nodes and all forces so far: Gauss-Seidel
-    sweeps over the springs, in order and in reverse in turn, from p = 0. After each pair of sweeps
+    node's energy over springs and volumes is nowhere above that of linear ones times 1 + q, which would limit the
+    step; d = STEEP_DRAG. The tissue kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves
+    for the remainder, p = dt K times the rate of length by w, from the masses of their nodes and all forces so far:
+    Gauss-Seidel sweeps over the springs, in order and in reverse in turn, from p = 0. After each pair of sweeps
     M' (v+ - v) = dt f - d (M' - M) v: symplectic Euler with larger masses, M <= M' <= M + dt^2 K, symmetric, and a drag
-    that outweighs what these take from or give to the motion as they change. The error of the sweeps is smallest in the
-    fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A spring
-    at rest gets no force, so the static equilibrium does not depend on dt.
+    that outweighs what these take from or give to the motion as they change. The error of the sweeps is smallest in
+    the fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A
+    spring at rest gets no force, so the static equilibrium does not depend on dt.
 
     In:  count: entries of `steep_springs`, each the first of `group_width` successive springs with a steep spring,
          sweeps_least: an even number as `steep_sweeps` of the model, dt [s]

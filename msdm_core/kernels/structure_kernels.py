@@ -67,7 +67,8 @@ def _field(name: str, unit: str, shape: str, lanes: str, meaning: str, dtype: st
 
 
 # Lengths: n_soft is n_node, n_steep n_spring and n_relaxing n_spring + n_tet + n_node (springs, tets, averaged volumes:
-# the elements that relax), or 0 if no tissue stiffens or relaxes; n_arm is 3 n_relaxing, n_point 4 n_surface, n_row n_shape n_point. See also `organ.state.state_sizes`.
+# the elements that relax), or 0 if no tissue stiffens or relaxes; n_arm is 3 n_relaxing, n_around the most nodes around
+# a triangle, n_point 4 n_surface, n_row n_shape n_point. See also `organ.state.state_sizes`.
 MODEL_FIELDS = (
     _field("node_rest_position", "m", "n_node 3", "first", "undeformed position"),
     _field("node_mass", "kg", "n_node", "own", "lumped mass"),

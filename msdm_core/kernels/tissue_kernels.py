@@ -54,7 +54,7 @@ from msdm_core.kernels.layout_kernels import (
     three_edges,
     where_moving,
 )
-from msdm_core.kernels.option_kernels import INLINED, INNER, KERNEL
+from msdm_core.kernels.option_kernels import INLINED, INNER
 from msdm_core.kernels.space_kernels import minus, plus, times, vector_product
 from msdm_core.kernels.vector_kernels import any_below, keep_lower
 

@@ -30,9 +30,9 @@ def box_mesh(
     """The block [0, sx] x [0, sy] x [0, sz] on a body-centred cubic lattice, with exact outer faces.
 
     Nodes are the corners and centres of the cells, along x, y and z in turn. Each inner face of a cell gives four tets
-    (two centres and an edge of the face), an outer face two. The diagonals of outer faces alternate like a checkerboard,
-    so that the block prefers no direction; the top face, where a tip presses, has nodes in the middle of its squares
-    instead, so that all of it yields alike.
+    (two centres and an edge of the face), an outer face two. The diagonals of outer faces alternate like a
+    checkerboard, so that the block prefers no direction; the top face, where a tip presses, has nodes in the middle of
+    its squares instead, so that all of it yields alike.
 
     Args:
         size: edge lengths [m], shape (3,).

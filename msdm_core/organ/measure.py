@@ -56,6 +56,7 @@ def element_strains(model: OrganModel, position: FloatArray) -> FloatArray:
     Springs, tets and averaged volumes are the elements that `Stiffening` and `Relaxation` apply to, (n_element,).
 
     Args:
+        model: the organ.
         position: of the nodes [m], (n_node, 3).
     """
     ends = position[model.spring_nodes]

@@ -30,7 +30,7 @@ ROOT_PARTS = 2**40
 
 
 def apply_stiffness(model: OrganModel, displacement: FloatArray, force: FloatArray) -> None:
-    """Fill `force` with the forces K u [N] of tissue and foundations, linearised at rest, of u [m]; both (n_node, 3)."""
+    """Fill `force` with forces K u [N] of tissue and foundations, linearised at rest, of u [m]; both (n_node, 3)."""
     multiply_stiffness(
         model.node_rest_position, model.spring_nodes, model.spring_stiffness, model.tet_nodes, model.tet_rest_volume,
         model.tet_bulk, model.node_rest_volume, model.node_bulk, displacement, np.empty(len(model.node_mass)), force,

@@ -245,7 +245,7 @@ class OrganBlock:
         """Tangent of springs, tets and averaged volumes and of the law at their nodes [N/m].
 
         An element of size V (l0^2 of a spring), strain e and linear tension K e has V f K (de de^T + e d2e), f being
-        the mean of w'(s) / s over its nodes. The factor of node a changes by f_a' ds_a with s_a ds_a = dU_a / (E_a V_a).
+        the mean of w'(s) / s over its nodes. The factor of node a changes by f_a' ds_a, s_a ds_a = dU_a / (E_a V_a).
         """
         model, count = self.model, position.size
         strain, springs, tets = element_strains(model, position), len(model.spring_nodes), len(model.tet_nodes)

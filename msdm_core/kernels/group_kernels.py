@@ -111,7 +111,10 @@ def set_node_law_groups(model, state, law):
     stiffens = steepens = False
     for first in range(0, whole, GROUP):
         low, high = load_group(pairs, 2 * first), load_group(pairs, 2 * first + GROUP)
-        change, rigidity = averaged_change(_firsts(low, high), load_group(inverse_volume, first)), load_group(bulk, first)
+        change, rigidity = (
+            averaged_change(_firsts(low, high), load_group(inverse_volume, first)),
+            load_group(bulk, first),
+        )
         energy = _seconds(low, high) + 2.0 * volume_energy(change, rigidity, load_group(volume, first))
         tension, square = rigidity * change, strain_square(energy, load_group(softness, first))
         begin = load_group(onset, first)

@@ -17,6 +17,7 @@ from msdm_core.kernels.layout_kernels import (
     group_width,
     load_column,
     load_item,
+    load_shared,
     set_node,
     store_column,
     take_from_node,
@@ -40,7 +41,9 @@ from msdm_core.kernels.vector_kernels import any_below, keep_lower
 # with 1 and 0.05. Without drag energy grows without bound, since the added mass varies with the strain; with 0.05 no
 # block, noisy, squeezed, sheared or swollen, exceeds 1.06 times its start at the shipped step.
 STEEP_HOLD, STEEP_DRAG = 1.0, 0.05
-VOLUME_HOLD = 0.35
+# Springs hold the rise of the volume term too: in a uniform expansion e springs have an energy of 15 mu e^2 / 2, and the
+# volume term of 9 K_t e^2 / 2, so that springs stiffer by this times K_t / mu bound it.
+VOLUME_HOLD = 0.6
 # Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
 # ends' speeds by a pull of 1 N, and its pull so far.
 STEEP_WIDTH = 6
@@ -133,15 +136,15 @@ def _set_speed(lanes, speed, velocity, force, inverse_mass, dt, node):
 def hold_steep(lanes, model, state, count, sweeps_least, dt):
     """Implicit rise of the tangent of steep springs: tension T + dt K dw/dt, w = v+ - (1 - d) v at both ends.
 
-    K = STEEP_HOLD k q (1 + sum g_i), with q the mean of (c - 1) v^2 of both ends: the tangent of a node's energy over
-    its springs is nowhere above that of springs with q alone, which would limit the step; d = STEEP_DRAG. The tissue
-    kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves for the remainder, p = dt K times
-    the rate of length by w, from the masses of their nodes and all forces so far: Gauss-Seidel sweeps over the springs,
-    in order and in reverse in turn, from p = 0. After each pair of sweeps M' (v+ - v) = dt f - d (M' - M) v: symplectic
-    Euler with larger masses, M <= M' <= M + dt^2 K, symmetric, and a drag that outweighs what these take from or give
-    to the motion as they change. The error of the sweeps is smallest in the fast motions, which would limit the step:
-    the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A spring at rest gets no force, so the static
-    equilibrium does not depend on dt.
+    K = h q (1 + sum g_i) with the model's `spring_hold` h and q the mean of (c - 1) v^2 of both ends: the tangent of a
+    node's energy over springs and volumes is nowhere above that of linear ones times 1 + q, which would limit the step;
+    d = STEEP_DRAG. The tissue kernel has applied T. For the springs with q above STEEP_EXCESS this kernel solves for the
+    remainder, p = dt K times the rate of length by w, from the masses of their nodes and all forces so far: Gauss-Seidel
+    sweeps over the springs, in order and in reverse in turn, from p = 0. After each pair of sweeps
+    M' (v+ - v) = dt f - d (M' - M) v: symplectic Euler with larger masses, M <= M' <= M + dt^2 K, symmetric, and a drag
+    that outweighs what these take from or give to the motion as they change. The error of the sweeps is smallest in the
+    fast motions, which would limit the step: the largest q of an organ needs (1 + q) SWEEPS_PER_TANGENT sweeps. A spring
+    at rest gets no force, so the static equilibrium does not depend on dt.
 
     In:  count: entries of `steep_springs`, each the first of `group_width` successive springs with a steep spring,
          sweeps_least: an even number as `steep_sweeps` of the model, dt [s]
@@ -167,6 +170,8 @@ def hold_steep(lanes, model, state, count, sweeps_least, dt):
             along = divided(along, spring_length(along))
             # Each of several organs side by side has its own steep springs.
             tangent = keep_lower(none + STEEP_EXCESS, more, load_item(lanes, hold, spring) * more, none)
+            if model.relaxes:
+                tangent = tangent * load_shared(lanes, steepness, model.element_gain, spring)
             give = dt * load_item(lanes, inverse_mass, i) + dt * load_item(lanes, inverse_mass, j)
             places[held] = spring
             store_column(lanes, rows, STEEP_WIDTH, held, 0, along[0])

@@ -36,8 +36,8 @@ class Material:
         youngs_modulus: E at rest and in equilibrium [Pa], above 0.
         density: [kg/m^3], above 0.
         poisson_ratio: nu, at least 1/4 (springs alone give 1/4; the volume term adds to it) and below 1/2.
-        stiffening: of its springs with strain, or None.
-        relaxation: of their tension with time, or None.
+        stiffening: with strain, or None.
+        relaxation: of its tension with time, or None.
 
     Raises:
         OrganError: names the field, its value and its range.

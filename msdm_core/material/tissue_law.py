@@ -12,7 +12,7 @@ from msdm_core.mesh.tet_mesh import FloatArray
 
 # Validated up to here (`stability.HELD_TANGENT`).
 TANGENT_CAP_LARGEST = 100.0
-# Maxwell arms of a spring.
+# Maxwell arms of a spring or a volume.
 ARM_COUNT = 3
 
 
@@ -20,13 +20,16 @@ ARM_COUNT = 3
 class Stiffening:
     """Linear tissue up to an onset strain, then a rising tangent up to a cap.
 
-    The springs around a node have the equivalent strain s, s^2 = 5 sum k (l - l0)^2 / sum k l0^2: the strain of a bar
-    of constant volume in tension or compression. Their energy is w(s) in place of s^2 / 2: a node multiplies tension by
-    w'(s) / s, a spring by the mean over its two ends. The tangent is w'' = 1 + (c - 1) v^2, v = (s - e0) / (e1 - e0)
-    within 0 and 1: a short toe and a steep rise as in Fung's exponential law (1967), as a piecewise polynomial, which
-    has the same bits on every machine. The strain of a node includes all directions, so stiffening tissue stays nearly
-    isotropic; if each spring stiffened by its own strain, the seven directions of a lattice would make a cubic solid
-    with buckling columns.
+    A node a has the equivalent strain s, s^2 = 2 U_a / (E_a V_a): that of a bar in tension or compression with the
+    same linear energy U_a, half of its springs', a quarter of its tets' and that of the volume averaged at it, with
+    E_a V_a = (E / (3 mu)) sum k l0^2 / 10 over its springs. The energy is the sum of E_a V_a w(s_a) in place of
+    E_a V_a s_a^2 / 2: linear tensions are multiplied by w'(s) / s, that of a spring by the mean over its two ends, of a
+    tet over its four corners, so that Poisson's ratio is the same at every strain. The tangent is
+    w'' = 1 + (c - 1) v^2, v = (s - e0) / (e1 - e0) within 0 and 1: a short toe and a steep rise as in Fung's
+    exponential law (1967), as a piecewise polynomial, which has the same bits on every machine. The strain of a node
+    includes all directions, so stiffening tissue stays nearly isotropic; if each spring stiffened by its own strain,
+    the seven directions of a lattice would make a cubic solid with buckling columns. The barrier of squeezed tets does
+    not stiffen.
 
     Args:
         onset_strain: e0, the end of linear tissue, at least 0.
@@ -86,13 +89,14 @@ class Stiffening:
 
 @dataclass(frozen=True)
 class Relaxation:
-    """Up to three Maxwell arms beside each spring: Prony terms of a quasi-linear solid (Fung 1993).
+    """Up to three Maxwell arms beside each spring and volume term: Prony terms of a quasi-linear solid (Fung 1993).
 
     The tension at time t is T_e(t) + sum_i g_i int exp(-(t - s) / tau_i) dT_e/ds ds with the elastic tension T_e: after
-    a step of strain it starts at (1 + sum g_i) T_e and ends at T_e, the static equilibrium. The volume term is elastic.
+    a step of strain it starts at (1 + sum g_i) T_e and ends at T_e, the static equilibrium. The tension of volumes
+    relaxes likewise, so that Poisson's ratio is the same at all times.
 
     Args:
-        relative_moduli: g_i, at least 0, up to three; relative to the spring at equilibrium.
+        relative_moduli: g_i, at least 0, up to three; relative to the tissue at equilibrium.
         times: tau_i [s], from 1 ms to 10^6 s, as many, increasing.
 
     Raises:

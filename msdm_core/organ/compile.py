@@ -346,16 +346,12 @@ def _tissue_law(
         fields["node_onset"] = onset
         fields["node_growth"] = 1.0 / width
         fields["node_excess"] = rise * width
+        fields["spring_hold"] = stiffness * spring_mean(STEEP_HOLD * (1.0 + VOLUME_HOLD * bulk / shear))
         fields["steep_rise"] = _steep_rise(onset, width, rise, nodes)
     if fields["relaxes"]:
-        moduli = np.stack(
-            [np.concatenate([spring_mean(arm), arm, node_mean(arm, weight)]) for arm in law.arm_modulus]
-        )
+        moduli = np.stack([np.concatenate([spring_mean(arm), arm, node_mean(arm, weight)]) for arm in law.arm_modulus])
         fields["element_gain"] = 1.0 + moduli.sum(axis=0)
         fields["element_arm_modulus"] = moduli.ravel()
-    if fields["stiffens"]:
-        hold = stiffness * spring_mean(STEEP_HOLD * (1.0 + VOLUME_HOLD * bulk / shear))
-        fields["spring_hold"] = hold * fields["element_gain"][: len(hold)] if fields["relaxes"] else hold
     return fields
 
 

@@ -76,7 +76,7 @@ def element_stiffness(model: OrganModel) -> FloatArray:
 
 
 def element_size(model: OrganModel) -> FloatArray:
-    """Twice the energy of each linear element over strain and tension: l0^2 [m^2], V0 [m^3], (n_element,)."""
+    """Twice the linear energy of each element over strain and tension, l0^2 [m^2] or V0 [m^3], (n_element,)."""
     return np.concatenate([np.square(model.spring_rest_length), model.tet_rest_volume, model.node_rest_volume])
 
 

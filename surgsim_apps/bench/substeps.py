@@ -91,7 +91,7 @@ def sheared(state: OrganState | LaneState, shear: float, advance: Callable[[int]
     def run(count: int) -> None:
         for first in range(0, count, SUBSTEPS_SHEARED):
             state.node_position[:] = start
-            for array in (state.node_velocity, state.spring_arm_tension, state.spring_relief):
+            for array in (state.node_velocity, state.element_arm_tension, state.element_relief):
                 array[:] = 0.0
             if not advance(min(SUBSTEPS_SHEARED, count - first)):
                 raise ValueError("the timed block diverged: its times are not valid")

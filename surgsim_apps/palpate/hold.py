@@ -29,12 +29,14 @@ class Hold:
     Fields:
         sites: of the presses [m]                                                                   (n, 3)
         force: held at the end of each press [N]                                                    (n,)
+        slope: dF/dd at the end of each press [N/m]                                                 (n,)
         expected: of a half space of the same tissue at the same depth (Hertz 1881) [N]             (n,)
         far_share: largest travel of a node in the farther half of the organ over the tip's depth   (n,)
     """
 
     sites: FloatArray
     force: FloatArray
+    slope: FloatArray
     expected: FloatArray
     far_share: FloatArray
 
@@ -89,6 +91,7 @@ def hold_of(anatomy: Anatomy, presses: Sequence[Press], *, modulus_factor: float
     return Hold(
         sites=np.array([press.site for press in complete]),
         force=np.array([press.force for press in complete]),
+        slope=np.array([press.slope for press in complete]),
         expected=np.array(expected),
         far_share=np.array([press.far_travel / press.depth for press in complete]),
     )

@@ -30,6 +30,7 @@ from surgsim_env.scene import (
     ForceSensor,
     PalpableFace,
     Scene,
+    hidden_share,
     load_anatomy,
     tangent_axes,
     with_added_mass,
@@ -83,6 +84,15 @@ class PalpationResult:
     def model_map(self) -> ContrastMap:
         """The map against the pre-operative model."""
         return self.maps[1]
+
+    @property
+    def hidden_share(self) -> float:
+        """Share of contrast - 1 that contact hides at the used site with the largest force."""
+        scene = self.anatomy.scene
+        pressed = [press for press, used in zip(self.presses, self.used, strict=True) if used]
+        hardest = max(pressed, key=lambda press: press.force)
+        tip, depth = scene.instrument.tip_radius, scene.palpation.press_depth
+        return hidden_share(hardest.force, hardest.slope, tip, depth, scene.contact.stiffness)
 
     @property
     def sites(self) -> FloatArray:

@@ -15,7 +15,6 @@ from surgsim_apps.palpate.hold import place_text
 from surgsim_apps.palpate.palpation import MODEL, MODEL_SITE_ERROR, PalpationResult
 from surgsim_apps.palpate.results import surgsim_version
 from surgsim_apps.reports.html_page import Picture, render_page
-from surgsim_env.scene import hidden_share
 
 # Cells of a table, the first of which names the row.
 Rows = list[tuple[str, ...]]
@@ -134,7 +133,6 @@ def _settings(palpation: PalpationResult) -> Rows:
     scene, presses, mesh = palpation.anatomy.scene, palpation.presses, palpation.anatomy.mesh
     tip, depth, material = scene.instrument.tip_radius, scene.palpation.press_depth, scene.material
     forces = np.array([press.force for press in presses])[palpation.used]
-    share = hidden_share(float(forces.max()), tip, depth, scene.contact.stiffness)
     towards = ", ".join(f"{value:.3g}" for value in scene.instrument.approach)
     strain, pressure = (max(getattr(press.load, name) for press in presses) for name in ("strain", "pressure"))
     return [
@@ -142,7 +140,7 @@ def _settings(palpation: PalpationResult) -> Rows:
         ("sites", f"{len(presses)}, {scene.palpation.site_spacing * 1e3:g} mm apart"),
         ("force held at the end", f"{forces.min():.3f} to {forces.max():.3f} N, median {np.median(forces):.3f} N"),
         ("largest strain and pressure", f"{strain:.2f}, {pressure / 1e3:.1f} kPa"),
-        ("contrast over 1 that contact hides", f"about {share:.1%} at the largest force"),
+        ("contrast over 1 that contact hides", f"about {palpation.hidden_share:.1%} at the largest force"),
         ("hold", "no complete press" if palpation.hold is None else palpation.hold.text),
         ("organ", f"{mesh.node_count} nodes, {mesh.tet_count} tets, healthy tissue of {material.youngs_modulus:g} Pa"),
         (

@@ -15,7 +15,7 @@ from surgsim_apps.palpate.contrast_map import ContrastMap
 from surgsim_apps.palpate.hold import Hold
 from surgsim_apps.palpate.misses import Miss
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, MODEL_SITE_ERROR, PalpationResult
-from surgsim_env.scene import contact_radius, hidden_share, mesh_bias
+from surgsim_env.scene import contact_radius, mesh_bias
 
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "palpation.csv", "summary.json", "report.html"
 PICTURE_NAME, ORGAN_NAME = "stiffness_map.png", "organ.png"
@@ -55,7 +55,6 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
     """Write the summary; undefined numbers, such as the error of a missed lesion, are null."""
     scene, mesh = palpation.anatomy.scene, palpation.anatomy.mesh
     tip, depth, cell = scene.instrument.tip_radius, scene.palpation.press_depth, palpation.anatomy.palpable_cell
-    force = max(press.force for press, used in zip(palpation.presses, palpation.used, strict=True) if used)
     both = (*palpation.presses, *palpation.model_presses)
     summary = {
         "inputs": dict(inputs),
@@ -69,7 +68,7 @@ def write_summary(palpation: PalpationResult, path: Path, inputs: Mapping[str, A
             "cell_over_contact_radius": cell / contact_radius(tip, depth),
             "force_added_by_mesh": mesh_bias(cell, tip, depth),
             "contact_stiffness_N_per_m3": scene.contact.stiffness,
-            "contrast_hidden_by_contact": hidden_share(force, tip, depth, scene.contact.stiffness),
+            "contrast_hidden_by_contact": palpation.hidden_share,
             "spacing_m": scene.palpation.site_spacing,
             "substeps_per_haptic_step": scene.timing.substep_count,
             "haptic_step_s": scene.timing.haptic_step,

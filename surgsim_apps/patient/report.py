@@ -11,6 +11,7 @@ from msdm_core.arithmetic import matmul
 from msdm_core.material import Lesion, lesion_extent
 from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality
 from msdm_core.organ import compile_organ, stable_dt
+from surgsim_apps.palpate.hold import Hold
 from surgsim_apps.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_apps.patient.patient_scene import PatientScene
 from surgsim_apps.patient.retract_scene import RetractScene, retraction_text
@@ -18,7 +19,7 @@ from surgsim_apps.patient.supports import held_text
 from surgsim_apps.reports.html_page import Picture, render_page
 from surgsim_apps.reports.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
 from surgsim_env.rendering import cut_edges
-from surgsim_env.scene import hertz_force, hidden_share, share_text
+from surgsim_env.scene import Scene, hidden_share, share_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -162,18 +163,19 @@ def _palpation(organ: PatientScene) -> Rows:
         ("approach", f"{x:g}, {y:g}, {z:g}"),
         ("sites", f"{organ.site_count}, {palpation.site_spacing * 1e3:g} mm apart"),
         ("cell / contact radius", share_text(organ.anatomy.palpable_cell, tip, depth)),
-        ("contact", hidden_text(2.0 * hertz_force(scene.material, tip, depth), tip, depth, scene.contact.stiffness)),
+        ("contact", "not checked" if organ.hold is None else _hidden_text(organ.hold, scene)),
         ("held", "not checked" if organ.hold is None else organ.hold.text),
         ("force limits", f"{scene.limits.soft_force:g} and {scene.limits.hard_force:g} N"),
     ]
 
 
-def hidden_text(force: float, tip_radius: float, press_depth: float, contact_stiffness: float) -> str:
-    """`hidden_share` in words."""
-    share = hidden_share(force, tip_radius, press_depth, contact_stiffness)
+def _hidden_text(hold: Hold, scene: Scene) -> str:
+    """`hidden_share` over a lesion with twice the force and the slope of the hardest healthy press, in words."""
+    force, slope, contact = 2.0 * float(hold.force.max()), 2.0 * float(hold.slope.max()), scene.contact.stiffness
+    share = hidden_share(force, slope, scene.instrument.tip_radius, scene.palpation.press_depth, contact)
     return (
-        f"contact hides about {share:.1%} of the contrast over 1 where a press feels {force:.2f} N: "
-        f"9 F / (4 pi k_p R d^2) with k_p {contact_stiffness:.3g} N/m^3"
+        f"contact of {contact:.3g} N/m^3 hides about {share:.1%} of the contrast over 1 where a press feels "
+        f"{force:.2f} N, twice as much as a healthy one"
     )
 
 

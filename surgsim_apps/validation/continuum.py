@@ -53,75 +53,85 @@ def determinant_and_cofactor(gradient: FloatArray) -> tuple[FloatArray, FloatArr
 
 @dataclass(frozen=True, eq=False)
 class SpringSolid:
-    """Affine springs with a common stiffening, and a volume term: W = 3 mu w(s) + (K_t / 2) (J - 1)^2.
+    """Affine springs and a volume term that stiffen together: W = E w(s).
 
-    s^2 = 5 <(|F N| - 1)^2> is the equivalent strain of `Stiffening`, and w' its tension; linear springs have
-    3 mu s^2 / 2.
+    E s^2 / 2 = (15 mu / 2) <(|F N| - 1)^2> + (K_t / 2) (J - 1)^2, the energy of linear springs with their volume term:
+    s, the strain of `Stiffening`, is that of a bar of Young's modulus E with the same linear energy. The stress is that
+    of linear tissue times w'(s) / s, so that Poisson's ratio is the same at every strain.
 
     Args:
-        shear_modulus: mu at small strain [Pa].
-        volume_modulus: K_t = lambda - mu [Pa].
-        stiffening: of the springs; None: linear.
+        shear_modulus: mu at small strain [Pa], one or (...).
+        volume_modulus: K_t = lambda - mu [Pa], one or (...).
+        stiffening: w; None: s^2 / 2.
         directions: N, (n, 3), and their weights (n,); by default the whole sphere.
     """
 
-    shear_modulus: float
-    volume_modulus: float
+    shear_modulus: FloatArray | float
+    volume_modulus: FloatArray | float
     stiffening: Stiffening | None = None
     directions: tuple[FloatArray, FloatArray] = sphere_directions()
 
-    def _springs(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """F N (..., n, 3), its length |F N|, (..., n), and the stress of linear springs [Pa], (..., 3, 3)."""
-        directions, weights = self.directions
-        spans = np.einsum("...ij,aj->...ai", gradient, directions)
-        stretch = np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
-        scale = 15.0 * self.shear_modulus * weights * (1.0 - 1.0 / stretch)
-        return spans, stretch, np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
-
-    def _rise(self, stretch: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Equivalent strain s, and the relative rise of tension and of tangent over linear springs."""
-        strain = np.sqrt(5.0 * np.einsum("a,...a->...", self.directions[1], (stretch - 1.0) ** 2))
-        if self.stiffening is None:
-            return strain, np.zeros_like(strain), np.zeros_like(strain)
-        strain = np.maximum(strain, STRAIN_LEAST)
-        return strain, self.stiffening.tension(strain) / strain - 1.0, self.stiffening.tangent(strain) - 1.0
-
     def first_piola(self, gradient: FloatArray) -> FloatArray:
-        """P = 15 mu (w' / s) <(1 - 1 / l) (F N) N^T> + K_t (J - 1) dJ/dF [Pa], l = |F N|, (..., 3, 3)."""
-        _, stretch, linear = self._springs(gradient)
-        volume, cofactor = determinant_and_cofactor(gradient)
-        rise = self._rise(stretch)[1]
-        return (
-            linear * (1.0 + rise)[..., None, None] + (self.volume_modulus * (volume - 1.0))[..., None, None] * cofactor
-        )
+        """P = (w' / s) (15 mu <(1 - 1 / l) (F N) N^T> + K_t (J - 1) dJ/dF) [Pa], l = |F N|, (..., 3, 3)."""
+        strain, linear = self._linear(gradient)
+        return linear * self._factors(strain)[0][..., None, None]
 
     def tangent(self, gradient: FloatArray) -> FloatArray:
         """dP/dF [Pa], (..., 3, 3, 3, 3)."""
         directions, weights = self.directions
-        spans, stretch, linear = self._springs(gradient)
-        share = 15.0 * self.shear_modulus * weights
+        spans, stretch = self._springs(gradient)
+        share = 15.0 * np.asarray(self.shear_modulus)[..., None] * weights
         dyads = np.einsum("...ai,aj->...aij", spans, directions).reshape(*stretch.shape, 9)
-        tangent = np.einsum("...a,...ax,...ay->...xy", share / stretch**3, dyads, dyads, optimize=True)
+        tangent = np.swapaxes(dyads * (share / stretch**3)[..., None], -1, -2) @ dyads
         tangent = tangent.reshape(*gradient.shape[:-2], 3, 3, 3, 3)
         across = np.einsum("...a,aj,al->...jl", share * (1.0 - 1.0 / stretch), directions, directions, optimize=True)
         tangent += np.einsum("ik,...jl->...ijkl", np.eye(3), across)
-        strain, rise, tangent_rise = self._rise(stretch)
-        tangent *= (1.0 + rise)[..., None, None, None, None]
-        # dw/dF is the stress of linear springs over 3 mu s.
-        slope = (tangent_rise - rise) / (3.0 * self.shear_modulus * np.maximum(strain, STRAIN_LEAST) ** 2)
-        tangent += slope[..., None, None, None, None] * np.einsum("...ij,...kl->...ijkl", linear, linear)
-        return tangent + volume_tangent(gradient, self.volume_modulus)
+        # K (dJ dJ + (J - 1) d2J), where d2J/dF_ij dF_kl = e_ikm e_jln F_mn, e being the permutation symbol.
+        volume, cofactor = determinant_and_cofactor(gradient)
+        second = np.einsum("ikm,jln,...mn->...ijkl", _PERMUTATION, _PERMUTATION, gradient, optimize=True)
+        second = _outer(cofactor, cofactor) + (volume - 1.0)[..., None, None, None, None] * second
+        tangent += np.asarray(self.volume_modulus)[..., None, None, None, None] * second
+        # ds/dF is the stress of linear tissue over E s.
+        strain, linear = self._linear(gradient)
+        secant, slope = self._factors(strain)
+        rise = (slope - secant) / (self._youngs_modulus * strain**2)
+        return secant[..., None, None, None, None] * tangent + rise[..., None, None, None, None] * _outer(
+            linear, linear
+        )
+
+    @property
+    def _youngs_modulus(self) -> FloatArray | float:
+        """E = mu (3 lambda + 2 mu) / (lambda + mu) with lambda = mu + K_t [Pa]."""
+        shear, volume = self.shear_modulus, self.volume_modulus
+        return shear * (5.0 * shear + 3.0 * volume) / (2.0 * shear + volume)
+
+    def _springs(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """F N (..., n, 3) and its length |F N|, (..., n)."""
+        spans = np.einsum("...ij,aj->...ai", gradient, self.directions[0], optimize=True)
+        return spans, np.sqrt(np.einsum("...ai,...ai->...a", spans, spans))
+
+    def _linear(self, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Strain s (...), at least STRAIN_LEAST, and the stress of linear tissue [Pa], (..., 3, 3)."""
+        directions, weights = self.directions
+        spans, stretch = self._springs(gradient)
+        volume, cofactor = determinant_and_cofactor(gradient)
+        pull = 15.0 * np.asarray(self.shear_modulus)
+        pressure = self.volume_modulus * (volume - 1.0)
+        energy = pull * ((stretch - 1.0) ** 2 @ weights) + pressure * (volume - 1.0)
+        scale = pull[..., None] * weights * (1.0 - 1.0 / stretch)
+        stress = np.einsum("...a,...ai,aj->...ij", scale, spans, directions, optimize=True)
+        strain = np.maximum(np.sqrt(energy / self._youngs_modulus), STRAIN_LEAST)
+        return strain, stress + pressure[..., None, None] * cofactor
+
+    def _factors(self, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Secant w' / s and slope w'' of the law."""
+        if self.stiffening is None:
+            return np.ones_like(strain), np.ones_like(strain)
+        return self.stiffening.tension(strain) / strain, self.stiffening.tangent(strain)
 
 
-def volume_tangent(gradient: FloatArray, modulus: float) -> FloatArray:
-    """Second derivative of (K / 2) (J - 1)^2 [Pa], (..., 3, 3, 3, 3).
-
-    K dJ dJ + K (J - 1) d2J, where d2J/dF_ij dF_kl = e_ikm e_jln F_mn, e being the permutation symbol.
-    """
-    volume, cofactor = determinant_and_cofactor(gradient)
-    second = np.einsum("ikm,jln,...mn->...ijkl", _PERMUTATION, _PERMUTATION, gradient, optimize=True)
-    both = np.einsum("...ij,...kl->...ijkl", cofactor, cofactor)
-    return modulus * (both + (volume - 1.0)[..., None, None, None, None] * second)
+def _outer(left: FloatArray, right: FloatArray) -> FloatArray:
+    return np.einsum("...ij,...kl->...ijkl", left, right)
 
 
 _PERMUTATION = np.zeros((3, 3, 3))

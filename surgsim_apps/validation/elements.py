@@ -80,8 +80,8 @@ def tet_compliance(mesh: TetMesh, triangles: IntArray, youngs_modulus: float, po
     basis = Basis(tets, ElementVector(ElementTetP2()), intorder=2)
     body = Elements.assembled(linear_elasticity(*lame_parameters(youngs_modulus, poisson_ratio)), basis)
     loaded = {tuple(nodes) for nodes in np.sort(triangles, axis=1).tolist()}
-    outer = tets.boundary_facets()
-    facets = [facet for facet in outer if tuple(sorted(tets.facets[:, facet].tolist())) in loaded]
+    corners = np.sort(np.asarray(tets.facets), axis=0).T.tolist()
+    facets = [facet for facet in tets.boundary_facets() if tuple(corners[facet]) in loaded]
     face = FacetBasis(tets, basis.elem, facets=np.array(facets), intorder=2)
     compliance = np.zeros(3)
     for axis in range(3):

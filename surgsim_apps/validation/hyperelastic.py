@@ -10,13 +10,13 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array
+from scipy.sparse import coo_array, csc_array, vstack
 from scipy.sparse.linalg import spsolve
 
 from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
 from msdm_core.material import Stiffening
 from msdm_core.mesh import FloatArray, TetMesh
-from msdm_core.organ import node_strains, rest_state
+from msdm_core.organ import element_means, element_size, element_stiffness, element_strains, node_strains, rest_state
 from surgsim_apps.validation.continuum import STRAIN_LEAST
 from surgsim_apps.validation.elements import Cells, Size
 from surgsim_apps.validation.statics import averaged_gradient, block_sum, node_rows, nodes_at, volume_gradient
@@ -221,7 +221,7 @@ class OrganBlock:
     Args:
         mesh: the block.
         model: its organ, without anchors.
-        stiffening: of its springs, for the matrix.
+        stiffening: of its tissue, for the matrix.
     """
 
     mesh: TetMesh
@@ -239,66 +239,65 @@ class OrganBlock:
         state.node_position[:] = self.model.node_rest_position + displacement.reshape(-1, 3)
         state.node_velocity[:] = 0.0
         evaluate_forces(self.model, state)
-        matrix = self._springs(state.node_position) + self._volumes(state.node_position)
-        return -state.node_force.ravel(), csc_array(matrix)
+        return -state.node_force.ravel(), self._matrix(state.node_position)
 
-    def _springs(self, position: FloatArray) -> csc_array:
-        """Tangent of the springs, (T / x) n n^T + (T / l) (1 - n n^T), x = l - l0, with its part by their ends [N/m].
+    def _matrix(self, position: FloatArray) -> csc_array:
+        """Tangent of springs, tets and averaged volumes and of the law at their nodes [N/m].
 
-        T = k x (1 + (r_a + r_b) / 2) with the rises r of both ends. r_a changes with all springs u of node a:
-        dr_a / dx_u = (dr_a / ds_a) q_a k_u x_u / s_a, s_a^2 = q_a sum k x^2.
+        An element of size V (l0^2 of a spring), strain e and linear tension K e has V f K (de de^T + e d2e), f being
+        the mean of w'(s) / s over its nodes. The factor of node a changes by f_a' ds_a with s_a ds_a = dU_a / (E_a V_a).
         """
-        model, nodes = self.model, self.model.spring_nodes
-        span = position[nodes[:, 1]] - position[nodes[:, 0]]
-        length = np.linalg.norm(span, axis=1)
-        direction, change = span / length[:, None], length - model.spring_rest_length
-        stiffness = model.spring_stiffness
-        strain = rise = np.zeros(len(position))
-        if self.stiffening is not None:
-            strain = np.maximum(node_strains(model, length), STRAIN_LEAST)
-            rise = self.stiffening.tension(strain) / strain - 1.0
-            stiffness = stiffness * (1.0 + rise[nodes].mean(axis=1))
-        across = (stiffness * change / length)[:, None, None]
-        dyads = direction[:, :, None] * direction[:, None, :]
-        along = (stiffness[:, None, None] - across) * dyads + across * np.eye(3)
-        blocks = np.block([[along, -along], [-along, along]])
-        total = _assembled(np.zeros((len(nodes), 6)), blocks, node_rows(nodes), position.size)[1]
-        if self.stiffening is None:
-            return total
-        pull = (model.spring_stiffness * change)[:, None] * direction
-        values = np.concatenate([-pull, pull], axis=1)
-        sums = coo_array(
-            (np.tile(values.ravel(), 2), (np.repeat(nodes.T.ravel(), 6), np.tile(node_rows(nodes).ravel(), 2))),
-            shape=(len(position), position.size),
-        ).tocsr()
-        slope = 0.5 * model.node_softness * (self.stiffening.tangent(strain) - 1.0 - rise) / strain**2
-        return csc_array(total + sums.T @ sums.multiply(slope[:, None]).tocsr())
-
-    def _volumes(self, position: FloatArray) -> csc_array:
-        """Tangent of the volume terms, K / V0 dV dV^T + p d2V, with the tension p of a tet and of its nodes [N/m]."""
         model, count = self.model, position.size
+        strain, springs, tets = element_strains(model, position), len(model.spring_nodes), len(model.tet_nodes)
+        equivalent = factor = np.ones(len(position))
+        if self.stiffening is not None:
+            equivalent = np.maximum(node_strains(model, strain), STRAIN_LEAST)
+            factor = self.stiffening.tension(equivalent) / equivalent
+        linear = element_size(model) * element_stiffness(model)
+        stiffness = linear * element_means(model, factor)
+        span = np.diff(position[model.spring_nodes], axis=1)[:, 0]
+        length = np.linalg.norm(span, axis=1)
+        direction, rest = span / length[:, None], model.spring_rest_length
+        along = np.concatenate([-direction, direction], axis=1) / rest[:, None]
         gradient = volume_gradient(position, model.tet_nodes)
-        volume = (gradient * position[model.tet_nodes].reshape(-1, 12)).sum(axis=1) / 3.0
-        ratio = volume / model.tet_rest_volume
-        tension, slope = model.tet_bulk * (ratio - 1.0), model.tet_bulk.copy()
+        changes = vstack([
+            _rows(node_rows(model.spring_nodes), along, count),
+            _rows(node_rows(model.tet_nodes), gradient / model.tet_rest_volume[:, None], count),
+            averaged_gradient(model.tet_nodes, gradient, count).multiply(1.0 / model.node_rest_volume[:, None]),
+        ]).tocsr()  # fmt: skip
+        total = changes.T @ changes.multiply(stiffness[:, None]).tocsr()
+        if self.stiffening is not None:
+            # Twice the derivative of each node's linear energy.
+            members = np.repeat(np.arange(springs + tets), np.repeat([2, 4], [springs, tets]))
+            ends = np.concatenate([model.spring_nodes.ravel(), model.tet_nodes.ravel(), np.arange(len(position))])
+            members = np.concatenate([members, springs + tets + np.arange(len(position))])
+            shares = np.repeat([0.5, 0.25, 1.0], [2 * springs, 4 * tets, len(position)])
+            shape = (len(position), len(strain))
+            sums = coo_array((shares * (linear * strain)[members], (ends, members)), shape=shape).tocsr() @ changes
+            slope = 2.0 * model.node_softness * (self.stiffening.tangent(equivalent) - factor) / equivalent**2
+            total = total + sums.T @ sums.multiply(slope[:, None]).tocsr()
+        tension = stiffness * strain
+        across = (tension[:springs] / (rest * length))[:, None, None] * (
+            np.eye(3) - direction[:, :, None] * direction[:, None, :]
+        )
+        bent = block_sum(np.block([[across, -across], [-across, across]]), node_rows(model.spring_nodes), count)
+        own, averaged = tension[springs : springs + tets], tension[springs + tets :]
+        pressure = own / model.tet_rest_volume + (averaged / model.node_rest_volume)[model.tet_nodes].mean(axis=1)
+        slope = np.zeros(tets)
+        ratio = 1.0 + strain[springs : springs + tets]
         squeezed = ratio < SQUEEZED_RATIO
         share = SQUEEZED_RATIO / ratio[squeezed]
-        tension[squeezed] += model.tet_barrier_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
-        slope[squeezed] += model.tet_barrier_bulk[squeezed] * share**2
-        if model.node_bulk.any():
-            node_volume = np.bincount(model.tet_nodes.ravel(), np.repeat(volume / 4.0, 4), len(position))
-            node_tension = model.node_bulk * (node_volume / model.node_rest_volume - 1.0)
-            tension = tension + node_tension[model.tet_nodes].mean(axis=1)
-        scale = slope / model.tet_rest_volume
-        blocks = scale[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
-        blocks += tension[:, None, None] * _volume_curvature(position[model.tet_nodes])
-        rows = node_rows(model.tet_nodes)
-        total = _assembled(np.zeros(rows.shape), blocks, rows, count)[1]
-        if model.node_bulk.any():
-            averaged = averaged_gradient(model.tet_nodes, gradient, count)
-            weighted = averaged.multiply((model.node_bulk / model.node_rest_volume)[:, None]).tocsr()
-            total = total + averaged.T @ weighted
-        return csc_array(total)
+        pressure[squeezed] += model.tet_barrier_bulk[squeezed] * (ratio[squeezed] - SQUEEZED_RATIO) * share
+        slope[squeezed] = model.tet_barrier_bulk[squeezed] * share**2
+        blocks = (slope / model.tet_rest_volume)[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+        blocks += pressure[:, None, None] * _volume_curvature(position[model.tet_nodes])
+        return csc_array(total + bent + block_sum(blocks, node_rows(model.tet_nodes), count))
+
+
+def _rows(columns: NDArray[np.int64], values: FloatArray, count: int) -> coo_array:
+    """Rows with values at some columns, both (n, m), (n, count)."""
+    row = np.repeat(np.arange(len(columns)), columns.shape[1])
+    return coo_array((values.ravel(), (row, columns.ravel())), shape=(len(columns), count))
 
 
 def _volume_curvature(corners: FloatArray) -> FloatArray:

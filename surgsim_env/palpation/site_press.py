@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from msdm_core.arithmetic import matmul, norm
+from msdm_core.arithmetic import log, matmul, norm
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import TissueLoad
@@ -26,6 +26,9 @@ AVERAGE_TIME = 0.04
 FOLLOWING_TIME = 0.010
 # Interval of the averaged readings of `press_phases` [s]; `recorded_phases` reads in each haptic step.
 READING_TIME = 0.010
+
+# Part of the way inward, in final depths, on which the slope of a press is measured; beyond it the tip brakes.
+SLOPE_DEPTHS = (0.75, 0.97)
 
 Tool = TypeVar("Tool")
 Result = TypeVar("Result")
@@ -102,6 +105,15 @@ class Press:
     end: str
     duration: float
     far_travel: float
+
+    @property
+    def slope(self) -> float:
+        """dF/dd at the end of a complete press [N/m]: n F / d, n of F ~ d^n fitted to the last of the way inward."""
+        low, high = SLOPE_DEPTHS
+        share = self.curve[:, 0] / self.depth
+        depth, force = log(self.curve[(share > low) & (share < high)]).T
+        away = depth - depth.mean()
+        return float((away * force).sum() / (away * away).sum()) * self.force / self.depth
 
 
 def stop_force(limits: Limits) -> float:

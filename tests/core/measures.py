@@ -7,7 +7,15 @@ from msdm_core.kernels.structure_kernels import OrganModel, OrganState
 from msdm_core.kernels.substep_kernels import evaluate_forces
 from msdm_core.material.tissue_law import ARM_COUNT, Relaxation
 from msdm_core.mesh.tet_mesh import FloatArray
-from msdm_core.organ.measure import node_rises, node_strains, spring_energies
+from msdm_core.organ.measure import (
+    element_energies,
+    element_means,
+    element_size,
+    element_stiffness,
+    element_strains,
+    node_rises,
+    node_strains,
+)
 from msdm_core.organ.motion import RATE, SIGNAL, WORK
 
 
@@ -47,55 +55,53 @@ def internal_forces(model: OrganModel, state: OrganState) -> FloatArray:
 
 
 def arm_energy(model: OrganModel, state: OrganState) -> float:
-    """Energy that the Maxwell arms of all springs store [J].
+    """Energy that all Maxwell arms store [J].
 
-    Arms of tension g (T - z), which have given way to the tensions z, store g (U(l) - U(l_z) - z . (l - l_z)) with the
-    energy U and tensions T of the elastic springs and T(l_z) = z: what they return where the springs go back to l_z at
-    once. While they give way at constant lengths, that energy only falls, because U is convex. Where g differs from
-    spring to spring, each has its share.
+    Arms of tension g (T - z), which have given way to the tensions z, store g (U(e) - U(e_z) - z . (e - e_z)) with the
+    energy U and tensions T of the elastic elements and T(e_z) = z: what they return where the elements go back to e_z
+    at once. While they give way at constant strains, that energy only falls, because U is convex. Where g differs from
+    element to element, each has its share.
 
     Raises:
-        ValueError: lengths with the tensions z were not found.
+        ValueError: strains with the tensions z were not found.
     """
     if not model.relaxes:
         return 0.0
-    ends = state.node_position[model.spring_nodes]
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    energy, total = spring_energies(model, length), 0.0
+    strain, size = element_strains(model, state.node_position), element_size(model)
+    energy, total = element_energies(model, strain), 0.0
     for modulus, given in zip(
-        model.spring_arm_modulus.reshape(ARM_COUNT, -1),
-        state.spring_arm_tension.reshape(ARM_COUNT, -1) * model.spring_rest_length,
-        strict=True,
+        model.element_arm_modulus.reshape(ARM_COUNT, -1), state.element_arm_tension.reshape(ARM_COUNT, -1), strict=True
     ):
-        reached = _lengths_of(model, given)
-        total += float(modulus @ (energy - spring_energies(model, reached) - given * (length - reached)))
+        reached = _strains_of(model, given)
+        total += float(modulus @ (energy - element_energies(model, reached) - size * given * (strain - reached)))
     return total
 
 
-LENGTH_ROUNDS, LENGTH_TOLERANCE = 500, 1e-13
+STRAIN_ROUNDS, STRAIN_TOLERANCE = 500, 1e-13
 
 
-def _lengths_of(model: OrganModel, tension: FloatArray) -> FloatArray:
-    """Lengths of the springs at some tensions [N] (n_spring,) [m], (n_spring,): the inverse of `spring_tensions`.
+def _strains_of(model: OrganModel, tension: FloatArray) -> FloatArray:
+    """Strains of the elements at some tensions, both (n_element,): the inverse of `element_tensions`.
 
-    l - l0 = T / (k (1 + mean of the rises of both ends)): a larger rise gives shorter springs and so a smaller rise.
-    Each node goes the part of the way that one alone would need, tension over strain over tangent.
+    e = T / (K (1 + mean of the rises of its nodes)): a larger rise gives smaller strains and so a smaller rise. Each
+    node goes the part of the way that one alone would need, tension over strain over tangent.
     """
-    linear = tension / model.spring_stiffness
+    stiffness = element_stiffness(model)
+    linear = np.divide(tension, stiffness, out=np.zeros_like(tension), where=stiffness > 0.0)
     if not model.stiffens:
-        return model.spring_rest_length + linear
+        return linear
     rise = np.zeros(len(model.node_mass))
-    for _ in range(LENGTH_ROUNDS):
-        length = model.spring_rest_length + linear / (1.0 + rise[model.spring_nodes].mean(axis=1))
-        strain = node_strains(model, length)
-        wanted = node_rises(model, strain)
-        if (np.abs(wanted - rise) <= LENGTH_TOLERANCE * (1.0 + rise)).all():
-            return length
-        ramp = np.clip((strain - model.node_onset) * model.node_growth, 0.0, 1.0)
+    for _ in range(STRAIN_ROUNDS):
+        strain = linear / (1.0 + element_means(model, rise))
+        equivalent = node_strains(model, strain)
+        wanted = node_rises(model, equivalent)
+        if (np.abs(wanted - rise) <= STRAIN_TOLERANCE * (1.0 + rise)).all():
+            return strain
+        ramp = np.clip((equivalent - model.node_onset) * model.node_growth, 0.0, 1.0)
         tangent = 1.0 + model.node_excess * model.node_growth * (ramp * ramp)
         rise = rise + (wanted - rise) * np.minimum((1.0 + wanted) / tangent, 1.0)
     raise ValueError(
-        f"no lengths were found for the tensions that the arms have given way to, in {LENGTH_ROUNDS} rounds"
+        f"no strains were found for the tensions that the arms have given way to, in {STRAIN_ROUNDS} rounds"
     )
 
 

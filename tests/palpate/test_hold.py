@@ -75,7 +75,7 @@ def test_the_shipped_liver_is_held():
 
 
 def press(*, force=0.2, depth=0.004, far=1e-4, end=""):
-    return SimpleNamespace(site=np.zeros(3), force=force, depth=depth, far_travel=far, end=end)
+    return SimpleNamespace(site=np.zeros(3), force=force, slope=50.0, depth=depth, far_travel=far, end=end)
 
 
 def test_figures_are_beside_hertz_at_the_depth_that_was_reached():
@@ -94,5 +94,5 @@ def test_figures_are_beside_hertz_at_the_depth_that_was_reached():
     [((0.9, 0.9, 0.1), 0.1, 0), ((0.9, 0.1, 0.1), 0.1, 1), ((0.9, 0.9, 0.9), 0.16, 1), ((0.1, 0.1, 0.9), 0.16, 2)],
 )
 def test_faults_are_the_median_force_and_the_largest_travel(force, far, faults):
-    hold = Hold(np.zeros((3, 3)), np.array(force), np.ones(3), np.array([0.01, far, 0.02]))
+    hold = Hold(np.zeros((3, 3)), np.array(force), np.ones(3), np.ones(3), np.array([0.01, far, 0.02]))
     assert len(hold.faults) == faults

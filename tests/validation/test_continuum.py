@@ -9,6 +9,7 @@ from surgsim_apps.validation.continuum import (
     lattice_directions,
     simple_shear_stress,
     sphere_directions,
+    stretch_across,
     uniaxial_stress,
 )
 
@@ -111,6 +112,15 @@ def test_a_bar_and_shear_of_small_strain():
     modulus = 9.0 * BULK * MU / (3.0 * BULK + MU)
     assert uniaxial_stress(solid, np.array([1.0 + size]))[0] == pytest.approx(modulus * size, rel=1e-4)
     assert simple_shear_stress(solid, np.array([size]))[0] == pytest.approx(MU * size, rel=1e-4)
+
+
+def test_stiffening_springs_keep_poissons_ratio():
+    """The sides of a bar move as those of linear tissue at every strain, and its strain is that of `Stiffening`."""
+    stretch = 1.0 + np.array([-0.3, -0.1, -1e-4, 1e-4, 0.1, 0.3])
+    across = stretch_across(SOLIDS["stiffening"], stretch)
+    np.testing.assert_allclose(across, stretch_across(SOLIDS["springs"], stretch), rtol=1e-9)
+    poisson = (3.0 * BULK - 2.0 * MU) / (2.0 * (3.0 * BULK + MU))
+    assert (1.0 - across[3]) / 1e-4 == pytest.approx(poisson, rel=1e-3)
 
 
 def test_volume_and_its_slope():

@@ -232,7 +232,7 @@ def test_a_lesion_needs_no_refit():
 
 
 def test_all_sizes_of_a_mesh_share_their_factors():
-    """Those of a fit to the scaled mesh itself, to rounding: f, F and the pull scale alike; of a bent mesh they differ."""
+    """Those of a fit to the scaled mesh, to rounding: f, F and the pull scale alike. A longer mesh has its own."""
     mesh = block(4)
     scaled = mesh.scaled(0.94).scaled(2.0)
     np.testing.assert_array_equal(scaled.points, 2.0 * (0.94 * mesh.points))

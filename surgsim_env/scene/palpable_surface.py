@@ -304,9 +304,9 @@ def contact_radius(tip_radius: float, press_depth: float) -> float:
 def mesh_bias(cell: float, tip_radius: float, press_depth: float) -> tuple[float, float]:
     """Estimate of the force that the mesh adds to a press, over that of infinitely small cells: least and most.
 
-    MESH_BIAS (h / a)^2 with cells h at the surface and the contact radius a. Presses of balls into linear tissue: blocks,
-    of one size or graded, are at the least, filled surfaces at the most; single places scatter by a third of the estimate
-    around it. Stiffening tissue is touched over a wider patch, and its presses have about half the bias.
+    MESH_BIAS (h / a)^2 with cells h at the surface and the contact radius a, for balls on linear tissue: the least on
+    blocks, of one size or graded, the most on filled surfaces. Measured means lie within a third of it; a tip no larger
+    than a cell gets half as much again. Tissue that stiffens is touched over a wider patch: half of it or less.
     """
     share = cell / contact_radius(tip_radius, press_depth)
     least, most = (factor * share * share for factor in MESH_BIAS)

@@ -73,6 +73,8 @@ CASES: tuple[Case, ...] = (
         )
         for cells, lesion in touch.CONTRASTS
     ),
+    Case("mesh bias", partial(touch.bias, 12, touch.BIAS_PRESSES), slow=True, needs_fem=True),
+    Case("mesh bias, fine", partial(touch.bias, 16, touch.BIAS_PRESSES), slow=True, needs_fem=True),
     Case("liver, contrast", touch.liver_contrast, slow=True, needs_fem=True),
     Case("large strain, linear", partial(tissue_law.large_strain, "slide", 6, None)),
     Case("large strain, stiffening", partial(tissue_law.large_strain, "slide", 6, LAW)),

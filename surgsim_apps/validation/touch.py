@@ -18,13 +18,13 @@ from msdm_core.material import Damping, Lesion
 from msdm_core.mesh import FloatArray
 from msdm_core.meshing import box_mesh
 from msdm_core.organ import OrganSpec, advance_or_raise, compile_organ, rest_state, round_shapes, stable_dt, tissue_load
-from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh
+from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh, spring_law
 from surgsim_apps.validation.punch import DISC, SIZE, Hidden, modulus_field
 from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
 from surgsim_apps.validation.statics import nodes_at
 from surgsim_env.coupling import Simulation
 from surgsim_env.palpation import press
-from surgsim_env.scene import BlockMesh, MeshSource, Scene, hidden_share, load_anatomy, make_scene
+from surgsim_env.scene import BlockMesh, MeshSource, Scene, hidden_share, load_anatomy, make_scene, mesh_bias
 
 REFERENCE = "scikit-fem, axisymmetric, neo-Hookean, rigid tip"
 # Press by the instrument: tolerances, and sites within a cell of the middle, in cells, for a mean over the places of a
@@ -32,6 +32,11 @@ REFERENCE = "scikit-fem, axisymmetric, neo-Hookean, rigid tip"
 FORCE_TOLERANCE = 0.20
 EXPONENT_TOLERANCE = 0.1
 OFFSETS = ((0.0, 0.0), (0.5, 0.5), (0.5, 0.0), (0.25, 0.25), (0.25, 0.5))
+
+# Estimate of the mesh's share of a force, against the measured mean.
+BIAS_TOLERANCE = 0.03
+# Tip radii and depths [m] of its presses.
+BIAS_PRESSES = ((0.005, 0.003), (0.008, 0.002), (0.008, 0.004), (0.012, 0.004))
 
 # Elements of the reference [m]: fine size, and its reach across and down.
 FINE, NEAR = 8e-4, (0.0128, 0.016)
@@ -202,6 +207,24 @@ def sites(
                 f"{name}, {statistic}", "homogeneous tissue", expected=0.0, measured=measured / force.mean(),
                 tolerance=tolerance, note=f"over the mean; {note}",
             )  # fmt: skip
+
+
+def bias(cells: int, cases: tuple[tuple[float, float], ...]) -> Iterator[Row]:
+    """Force that the mesh adds to presses of given tip radii and depths [m], against the estimate of the reports."""
+    scene, touch, cell = phantom(cells), block(cells, friction=0.0), SIZE[0] / cells
+    field, mesh = modulus_field(scene.material.youngs_modulus, None), layer_mesh(DISC, SIZE[2], FINE, NEAR)
+    limit = PressedLayer(mesh, field, scene.material.poisson_ratio, law=spring_law())
+    places = [0.5 * np.array(SIZE[:2]) + cell * np.array(offset) for offset in OFFSETS]
+    for radius, depth in cases:
+        force = float(np.mean([touch.held(place, radius, depth) for place in places]))
+        reference = limit.forces(radius, (depth,), scene.contact.stiffness)[0]
+        predicted = mesh_bias(cell, radius, depth)[0]
+        yield compare(
+            f"added by the mesh, cell {1e3 * cell:.3g} mm, tip {1e3 * radius:g} mm pressed {1e3 * depth:g} mm",
+            "estimate of the reports for blocks, `mesh_bias`", expected=predicted, measured=force / reference - 1.0,
+            tolerance=BIAS_TOLERANCE, absolute=True,
+            note=f"of the force of the springs' own limit, by scikit-fem, {reference:.4g} N; {len(OFFSETS)} sites",
+        )  # fmt: skip
 
 
 def tissue_loads(cells: int, tolerance: float) -> Iterator[Row]:

@@ -38,7 +38,6 @@ from surgsim_apps.validation.statics import DENSITY, assemble_stiffness, nodes_a
 from surgsim_env.coupling import haptic_steps, runs_compiled
 from surgsim_env.instruments import ToolBodies
 from surgsim_env.scene import Scene, load_anatomy, make_scene, substeps_needed
-from surgsim_env.scene.model import STABLE_STEP_SHARE
 
 SAMPLES = 400  # of a free motion
 STIFFER = 20e3  # [Pa] of the organs for the stable step
@@ -234,7 +233,7 @@ def stretched_block(model: OrganModel, stretch: float, ratio: float, spin: float
 
 
 def stretched_energy() -> Iterator[Row]:
-    """Energy of a block of liver's law, stretched by 12 % and released without damping, at the scene's share of its step.
+    """Energy of a block of liver's law, stretched by 12 % and released without damping, at the scene's relative step.
 
     Its steep springs are held implicitly, partly as a drag.
     """
@@ -247,7 +246,7 @@ def stretched_energy() -> Iterator[Row]:
     yield bounded(
         "energy kept after 0.1 s, block of liver's law stretched by 12 %", "conservation",
         measured=energy[np.abs(time - 0.1) < 0.01].mean(), least=0.85,
-        note=f"without damping, {share:.2f} of the stable step as in the scene; {energy[time > 1.9].mean():.2f} after 2 s",
+        note=f"without damping, {share:.2f} of the stable step, as the scene; {energy[time > 1.9].mean():.2f} after 2 s",
     )  # fmt: skip
     yield bounded(
         "largest energy, block of liver's law stretched by 12 %", "passivity, and the swing of symplectic Euler",

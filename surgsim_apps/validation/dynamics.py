@@ -297,7 +297,7 @@ def small_block(damping: Damping) -> OrganModel:
     """Block of 30 x 30 x 20 mm with 5 mm cells, bonded below."""
     mesh = box_mesh(BLOCK, CELLS)
     material, floor = Material(MODULUS, 1060.0, 0.45), nodes_at(mesh.points, 0.0)
-    return compile_organ(OrganSpec(mesh, material, anchors=floor, damping=damping))
+    return compile_organ(OrganSpec(mesh, material, anchors=floor, damping=damping, mass_scheme="voronoi"))
 
 
 def free_ball(mass: float, radius: float, drop: float, *, joint: str = FREE) -> ToolBodies:

@@ -10,7 +10,18 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from surgsim_apps.validation import bars, capsule, dynamics, friction, lattice, paper_tests, punch, tissue_law, touch
+from surgsim_apps.validation import (
+    bars,
+    capsule,
+    dynamics,
+    friction,
+    lattice,
+    paper_tests,
+    punch,
+    tissue_law,
+    touch,
+    under_tip,
+)
 from surgsim_apps.validation.elements import MISSING, has_fem
 from surgsim_apps.validation.row import Case, Curve, Drawing, Result, Row
 
@@ -73,6 +84,10 @@ CASES: tuple[Case, ...] = (
         )
         for cells, lesion in touch.CONTRASTS
     ),
+    Case("under the tip, block", under_tip.block_presses, slow=True, needs_fem=True),
+    Case("under the tip, drags", under_tip.drags),
+    Case("under the tip, dome", under_tip.dome_presses, slow=True, needs_fem=True),
+    Case("under the tip, hidden", under_tip.hidden_by_contact, slow=True, needs_fem=True),
     Case("mesh bias", partial(touch.bias, 12, touch.BIAS_PRESSES), slow=True, needs_fem=True),
     Case("mesh bias, fine", partial(touch.bias, 16, touch.BIAS_PRESSES), slow=True, needs_fem=True),
     Case("liver, contrast", touch.liver_contrast, slow=True, needs_fem=True),

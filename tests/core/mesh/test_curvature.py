@@ -84,7 +84,6 @@ def test_a_sphere_rises_by_the_height_of_its_arcs():
         outward = ends.mean(axis=2) / np.linalg.norm(ends.mean(axis=2), axis=2)[:, :, None]
         height = (rises(edge_rise(points, triangles), points) * outward).sum(axis=2)
         errors.append(float(np.abs(height / (squared / (8.0 * radius)) - 1.0).max()))
-    print(errors)
     assert errors[0] < 0.1
     assert errors[1] < errors[0] / 3.0 and errors[2] < errors[1] / 3.0
 

@@ -138,15 +138,19 @@ def contact_energy(
 ) -> float:
     """E = sum over shapes and quadrature points of (k_p / 2) w A0 g^2, g = s (s + t) / r [J].
 
+    A point lies on the quadratic triangle: lambda_a a + lambda_b b + lambda_c c, and 4 lambda_b lambda_c times the rise
+    of the edge opposite to a and so on, each rise a sum of weight times place over the nodes around the triangle.
     d runs from the nearest point of the shape's axis to the quadrature point, n is the triangle's deformed normal,
     t = d . n, s^2 = r^2 - (|d|^2 - t^2). Counted are points with s^2 > 0, s + t > 0 and (t <= 0 or already engaged).
     """
     energy = 0.0
+    bulge = 4.0 * np.array([[b * c, c * a, a * b] for a, b, c in QUADRATURE])
     for shape, radius in enumerate(shapes.shape_radius):
         for triangle, corners in enumerate(position[model.surface_triangles]):
             normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
             normal = normal / np.linalg.norm(normal)
-            points = QUADRATURE @ corners
+            rise = model.surface_rise[triangle].T @ position[model.surface_around[triangle]]
+            points = QUADRATURE @ corners + bulge @ rise
             offset = points - nearest_on_core(shapes.shape_ends[shape], shapes.shape_span[shape], points)
             height = offset @ normal
             chord_squared = radius**2 - ((offset * offset).sum(axis=1) - height**2)

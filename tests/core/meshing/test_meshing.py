@@ -31,16 +31,22 @@ def boundary_edge_counts(mesh):
 @pytest.mark.parametrize(
     ("size", "cells", "nodes", "tets"),
     [
-        ((0.02, 0.05, 0.10), (2, 5, 10), 298, 1200),
-        ((0.10, 0.10, 0.30), (5, 5, 15), 951, 4500),
-        ((0.12, 0.12, 0.06), (12, 12, 6), 2047, 10368),
+        ((0.02, 0.05, 0.10), (2, 5, 10), 308, 1220),
+        ((0.10, 0.10, 0.30), (5, 5, 15), 976, 4550),
+        ((0.12, 0.12, 0.06), (12, 12, 6), 2191, 10656),
     ],
 )
 def test_block_has_the_known_counts_volume_and_faces(size, cells, nodes, tets):
-    mesh = box_mesh(size, cells)
+    """A square of the top gives one more node and four tets of half the size, where others give two tets."""
+    mesh, plain = box_mesh(size, cells), box_mesh(size, cells, top_nodes=False)
+    squares = cells[0] * cells[1]
     assert (mesh.node_count, mesh.tet_count) == (nodes, tets)
+    assert (plain.node_count, plain.tet_count) == (nodes - squares, tets - 2 * squares)
     assert mesh.volumes.sum() == pytest.approx(np.prod(size), rel=1e-12)
-    np.testing.assert_allclose(mesh.volumes, np.prod(size) / np.prod(cells) / 12, rtol=1e-10)
+    whole = np.prod(size) / np.prod(cells) / 12
+    np.testing.assert_allclose(plain.volumes, whole, rtol=1e-10)
+    np.testing.assert_allclose(np.sort(mesh.volumes)[: 4 * squares], whole / 2, rtol=1e-10)
+    np.testing.assert_allclose(np.sort(mesh.volumes)[4 * squares :], whole, rtol=1e-10)
     outer = mesh.points[mesh.boundary_nodes]
     assert ((outer == 0) | (outer == np.array(size))).any(axis=1).all()
     a, b, c = (mesh.points[mesh.boundary_triangles[:, k]] for k in range(3))
@@ -52,11 +58,13 @@ def test_block_has_the_known_counts_volume_and_faces(size, cells, nodes, tets):
 
 def test_inner_tets_of_a_block_are_bcc_tets():
     mesh = box_mesh((0.04, 0.04, 0.04), (4, 4, 4))
-    centres = (mesh.tets >= 125).sum(axis=1)
+    is_centre = (np.rint(mesh.points / 0.005).astype(int) % 2 == 1).all(axis=1)
+    centres = is_centre[mesh.tets].sum(axis=1)
     angles = np.sort(dihedral_angles(mesh)[centres == 2], axis=1)
     np.testing.assert_allclose(angles, np.tile([60, 60, 60, 60, 90, 90], (len(angles), 1)), atol=1e-6)
     lengths = np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1)[:, 0], axis=1) / 0.01
-    assert np.isclose(lengths[:, None], [1, np.sqrt(0.75), np.sqrt(2)]).any(axis=1).all()
+    # Half a diagonal and half a cell at the nodes in the middle of the top face's squares.
+    assert np.isclose(lengths[:, None], [1, np.sqrt(0.75), np.sqrt(2), np.sqrt(0.5), 0.5]).any(axis=1).all()
 
 
 def test_diagonals_of_outer_faces_alternate():
@@ -67,7 +75,8 @@ def test_diagonals_of_outer_faces_alternate():
         across = [k for k in range(3) if k != axis]
         in_plane = flat & np.isclose(vectors[:, axis], 0)
         turn = np.sign(vectors[in_plane][:, across].prod(axis=1))
-        assert len(turn) == 2 * {0: 8, 1: 8, 2: 16}[axis]
+        # The top's squares have nodes in their middle instead.
+        assert len(turn) == {0: 16, 1: 16, 2: 16}[axis]
         assert turn.sum() == 0
         cells = np.floor(mesh.points[mesh.edges[in_plane]].mean(axis=1)[:, across] / 0.01).sum(axis=1)
         assert len(set(zip(cells % 2, turn, strict=True))) == 2

@@ -37,8 +37,7 @@ from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
 from surgsim_apps.validation.statics import DENSITY, assemble_stiffness, nodes_at
 from surgsim_env.coupling import haptic_steps, runs_compiled
 from surgsim_env.instruments import ToolBodies
-from surgsim_env.scene import Scene, load_anatomy, make_scene, substeps_needed
-from surgsim_env.scene.model import STABLE_STEP_SHARE
+from surgsim_env.scene import STABLE_STEP_SHARE, Scene, load_anatomy, make_scene, substeps_needed
 
 SAMPLES = 400  # of a free motion
 STIFFER = 20e3  # [Pa] of the organs for the stable step

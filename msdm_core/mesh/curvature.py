@@ -10,7 +10,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 
 from msdm_core.arithmetic import dot, eigh, norm, solve
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, area_vectors
@@ -85,9 +84,22 @@ def edge_rise(points: FloatArray, triangles: NDArray[np.integer]) -> EdgeRise:
 
 def _widest(triangles: NDArray[np.integer]) -> int:
     """Largest number of nodes around a triangle, creases left out: the same for all organs of the same tets."""
-    count = len(triangles)
-    corner = coo_array((np.ones(3 * count), (np.repeat(np.arange(count), 3), triangles.ravel()))).tocsr()
-    return int(np.diff((corner @ (corner.T @ corner)).tocsr().indptr).max())
+    corner, around = _triangles_around(triangles, triangles.ravel())
+    count = int(triangles.max()) + 1
+    pairs = np.unique((corner // 3)[:, None] * count + triangles[around])
+    return int(np.bincount(pairs // count).max())
+
+
+def _triangles_around(
+    triangles: NDArray[np.integer], nodes: NDArray[np.integer]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Index into `nodes` and triangle of each pair of one of these nodes and a triangle at it, by nodes in order."""
+    order = np.argsort(triangles.ravel(), kind="stable")
+    start = np.searchsorted(triangles.ravel()[order], np.arange(int(triangles.max()) + 2))
+    lengths = np.diff(start)[nodes]
+    owner = np.repeat(np.arange(len(nodes)), lengths)
+    offset = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return owner, order[np.repeat(start[nodes], lengths) + offset] // 3
 
 
 def _edge_weights(
@@ -100,12 +112,8 @@ def _edge_weights(
     np.add.at(up, edge_of.ravel(), np.repeat(area, 3, axis=0))
     up /= np.maximum(norm(up, axis=1), np.finfo(float).tiny)[:, None]
     # Triangles around the ends of each edge, without those beyond a crease.
-    order = np.argsort(triangles.ravel(), kind="stable")
-    start = np.searchsorted(triangles.ravel()[order], np.arange(count + 1))
-    lengths = np.diff(start)[ends.ravel()]
-    edge = np.repeat(np.arange(ends.size) // 2, lengths)
-    offset = np.arange(len(edge)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    around = order[np.repeat(start[ends.ravel()], lengths) + offset] // 3
+    end, around = _triangles_around(triangles, ends.ravel())
+    edge = end // 2
     near = dot(unit[around], up[edge]) > CREASE_COSINE
     edge, around = edge[near], around[near]
     pairs = np.unique(edge[:, None] * count + triangles[around])

@@ -14,7 +14,7 @@ from msdm_core.organ.measure import (
     tissue_load,
 )
 from msdm_core.organ.motion import SIGNAL
-from msdm_core.organ.stability import contact_node_area, stable_dt
+from msdm_core.organ.stability import contact_node_area, scale_mass, stable_dt
 from msdm_core.organ.state import blank_state
 from msdm_core.organ.stepping import (
     NO_CONTACT,
@@ -52,6 +52,7 @@ __all__ = [
     "potential_energy",
     "rest_state",
     "round_shapes",
+    "scale_mass",
     "stable_dt",
     "support_forces",
     "tissue_load",

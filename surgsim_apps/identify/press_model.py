@@ -22,10 +22,10 @@ from msdm_core.organ import (
     describe_fault,
     rest_state,
     round_shapes,
+    scale_mass,
     stable_dt,
     tissue_load,
 )
-from msdm_core.organ.stability import scale_mass
 
 # Of the run: the modulus [Pa], which cancels, and the density [kg/m^3], without influence on a static press.
 MODULUS, DENSITY = 1000.0, 1000.0

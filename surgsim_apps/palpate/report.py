@@ -108,7 +108,7 @@ def _extrapolation(palpation: PalpationResult) -> list[str]:
     """A sentence on presses that strain the tissue beyond its law's support; empty if none does."""
     supported = palpation.anatomy.scene.material.strain_supported
     strains = [press.load.equivalent_strain for press in palpation.presses]
-    count = sum(strain > supported for strain in strains)
+    count = len([strain for strain in strains if strain > supported])
     if not count:
         return []
     return [

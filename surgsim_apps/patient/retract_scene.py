@@ -191,7 +191,6 @@ def _scene(organ: PatientScene, rim: Rim, mesh: TetMesh, out: Path) -> Scene:
         gravity=(0.0, 0.0, 0.0),
         anchors=_anchors(mesh),
         supports=(bed,),
-        contact=replace(lobe.contact, stiffness=patient.contact.stiffness),
         instrument=replace(
             lobe.instrument,
             tip_radius=LAYOUT.right_tip_radius,

@@ -77,7 +77,7 @@ def retract_text(organ: PatientScene, retraction: RetractScene) -> str:
         "edge",
         "supports.position": f"[m] its top {RETRACT.bed_gap * 1e3:g} mm below the lowest of the organ above it",
         "supports.friction": "as in the scene lobe",
-        "contact": "of tools and of the bed",
+        "contact": "of tools and of the bed, as in the scene lobe: as stiff as light fingers bear",
         "instrument": "the jaw points along the middle of the edge",
         "instrument.tip_radius": "[m] chosen: of a right arm's ball, wider than its neck",
         "port": "as in the scene lobe, at the same distance from the edge",

@@ -16,15 +16,17 @@ PORTS = {"grasper.xml": None, "psm_retractor": Port((0.02, 0.13, 0.05), (0.0, -0
 
 
 def slab_scene(model: str) -> Scene:
-    """The phantom's tissue as a slab, and an instrument that comes to its edge along -y with a level jaw."""
+    """The phantom's tissue as a slab with the lobe's contact, and an instrument with a level jaw at its edge, along -y."""
     width, _, height = SIZE
     wall = Box((-0.001, -0.001, -0.001), (width + 0.001, 1e-4, height + 0.001))
-    phantom = make_scene("phantom")
+    phantom, lobe = make_scene("phantom"), make_scene("lobe")
     return replace(
         phantom,
         name="slab",
-        mesh=MeshSource(block=BlockMesh(SIZE, (10, 6, 3))),
+        mesh=MeshSource(block=BlockMesh(SIZE, (10, 6, 3), top_nodes=False)),
         anchors=(Anchor("wall", box=wall),),
+        # As stiff as fingers of 8 g bear: 16 x 14 mm of a pad at the phantom's need 13 g.
+        contact=lobe.contact,
         timing=replace(phantom.timing, substep_count=5),
         palpation=replace(phantom.palpation, face_margin=0.0),
         instrument=SceneInstrument(model, 0.008, approach=(0.0, -1.0, -0.3), tip_direction=(0.0, -1.0, 0.0)),

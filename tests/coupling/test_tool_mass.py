@@ -87,8 +87,9 @@ def test_shipped_scenes_pass_with_room(name: str):
     simulation = Simulation(load_anatomy(make_scene(name)))
     area = float(simulation.organ_model.surface_rest_area.sum())
     (tool,) = tool_masses(simulation.instrument, simulation.contact, area)
-    assert tool.mass == pytest.approx(0.08, rel=1e-9)  # the z slide and the tip
-    assert tool.mass > 2.0 * tool.least_mass
+    assert tool.mass == pytest.approx(0.18, rel=1e-9)  # the z slide and the tip
+    # The liver's: k_p 1.5e8 on a ball of 12 mm and a shaft, 0.195e6 N/m, need 98 g. The bound is safe by 1.5 (below).
+    assert tool.mass > 1.8 * tool.least_mass
 
 
 def test_a_scene_whose_contact_is_too_stiff_for_its_tool_is_refused():
@@ -97,7 +98,7 @@ def test_a_scene_whose_contact_is_too_stiff_for_its_tool_is_refused():
     stiff = replace(
         scene, contact=replace(scene.contact, stiffness=4e8), timing=replace(scene.timing, substep_count=50)
     )
-    with pytest.raises(OrganError, match=r"'phantom'.* 80 g"):
+    with pytest.raises(OrganError, match=r"'phantom'.* 180 g"):
         Simulation(replace(load_anatomy(scene), scene=stiff))
 
 

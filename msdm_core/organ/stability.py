@@ -153,13 +153,14 @@ def contact_hold(model: OrganModel, contact: ContactLaw, dt: float) -> tuple[flo
 
 
 def contact_excess(hold: float, share: float = 1.0) -> float:
-    """Part of the hold h of implicit contact that still limits the explicit step, of the limit 4; 0 for h <= 20.
+    """Part of the hold h of implicit contact that still limits the explicit step, of the limit 4; 0 for h <= 16.
 
     Stiffness is over mass and times dt^2 here. A motion with the hold k <= h gets the force of its stiffness, a share
     of k, at the start of the substep; the sweeps of `contact_kernels.hold_contact` then leave v (1 + k R) / (1 + k) of
     a velocity v, with R = prod (1 - w_j (1 + k) / (1 + h)) over the factors w_j of the sweeps. This acts as a mass of
     Q = (1 + k) / (1 + k R): symplectic Euler is stable for share k + t <= 2 (1 + Q), with t the stiffness of the organ
     itself. So t must stay below 4 less the largest share k - 2 (Q - 1). Pure damping (share 0) leaves 0.
+    Infinite where the sweeps overshoot, 1 + k R <= 0.
     """
     held = hold * np.linspace(0.0, 1.0, 1001)
     left = np.prod([1.0 - factor * (1.0 + held) / (1.0 + hold) for factor in SWEEPS], axis=0)

@@ -155,7 +155,7 @@ class PalpableFace:
         if hit is None or self.thickness[hit[0]] < self.thickness_smallest:
             return None
         point, normal = self._at(*hit)
-        if self.rim_distance(point) < self.margin - slack or not self.is_clear(point, normal):
+        if self.rim_distance(point) < self.margin - slack - ROUNDING or not self.is_clear(point, normal):
             return None
         return point, normal
 
@@ -290,6 +290,8 @@ def _drop(plane: FloatArray, height: FloatArray, u: float, v: float) -> tuple[in
     return int(inside[best]), weights[best]
 
 
+# Distance [m] by which rounding may put a site at the margin nearer to the border.
+ROUNDING = 1e-9
 # Largest cell over contact radius; on coarser cells the force varies more between sites than over a deep lesion.
 SHARE_LARGEST = 1.0
 # Relative bias of a press at cell = contact radius: on blocks, and on filled surfaces.

@@ -16,7 +16,7 @@ PORTS = {"grasper.xml": None, "psm_retractor": Port((0.02, 0.13, 0.05), (0.0, -0
 
 
 def slab_scene(model: str) -> Scene:
-    """The phantom's tissue as a slab with the lobe's contact, and an instrument with a level jaw at its edge, along -y."""
+    """The phantom's tissue as a slab, and an instrument that comes to its edge along -y with a level jaw."""
     width, _, height = SIZE
     wall = Box((-0.001, -0.001, -0.001), (width + 0.001, 1e-4, height + 0.001))
     phantom, lobe = make_scene("phantom"), make_scene("lobe")

@@ -63,9 +63,10 @@ def pushed(what: dict, damping: float, share: float, count: int) -> tuple[float,
 def test_contact_at_the_limit_takes_energy_and_dies_out(name):
     """The loop never gives back more than the hand has put in, at the largest stiffness that is not refused."""
     what, damping = DEVICES[name]
-    least, late_speed = pushed(what, damping, 1.0, 2000)
+    # Tip and device, 0.23 kg, without a damper halve their speed every 0.8 s.
+    least, late_speed = pushed(what, damping, 1.0, 3600)
     assert least >= -ROUNDING
-    # The press itself begins at some 50 mm/s.
+    # The press itself begins at some 90 mm/s.
     assert late_speed < 5e-3
 
 

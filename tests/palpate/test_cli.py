@@ -97,7 +97,7 @@ def test_summary_gives_the_truth_and_the_error(summary):
     assert entry["felt"] == 1
     assert entry["false_alarms"] == 0
     place = np.array(entry["estimates"][lesion["estimate"]]["point_m"])
-    # Along the surface: between points on edges, an eighth of 5 mm apart, off by their gap at most over less than an edge.
+    # The path leads over points on edges: off by their gap at most, an eighth of 5 mm, over less than an edge.
     straight = 1e3 * np.linalg.norm(place - truth["surface_point_m"])
     assert straight - 1e-3 < lesion["error_mm"] < straight + 5.0 / 8.0
     assert lesion["error_mm"] < 8.0

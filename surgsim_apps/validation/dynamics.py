@@ -246,7 +246,7 @@ def stretched_energy() -> Iterator[Row]:
     yield bounded(
         "energy kept after 0.1 s, block of liver's law stretched by 12 %", "conservation",
         measured=energy[np.abs(time - 0.1) < 0.01].mean(), least=0.85,
-        note=f"without damping, {share:.2f} of the stable step, as the scene; {energy[time > 1.9].mean():.2f} after 2 s",
+        note=f"undamped, {share:.2f} of the stable step as in the scene; {energy[time > 1.9].mean():.2f} after 2 s",
     )  # fmt: skip
     yield bounded(
         "largest energy, block of liver's law stretched by 12 %", "passivity, and the swing of symplectic Euler",

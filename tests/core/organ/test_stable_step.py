@@ -33,7 +33,7 @@ PARTS = {
     "beta": (organ(Damping(alpha=0.0, beta=1e-3)), None, 1.1),
     "contact stiffness": (organ(), SOFT._replace(stiffness=2e8), 3.0),
     "sticking friction": (organ(), SOFT._replace(stiffness=2e7, friction=50.0, tangential_stiffness=8e8), 3.0),
-    "alpha with contact": (organ(Damping(alpha=3e4)), SOFT._replace(stiffness=2e8), 3.0),
+    "alpha with contact": (organ(Damping(alpha=3e4)), SOFT._replace(stiffness=3e7), 3.0),
     "beta with contact": (organ(Damping(alpha=0.0, beta=1e-2)), SOFT._replace(stiffness=2e8), 3.0),
 }
 
@@ -85,15 +85,15 @@ def test_each_part_shortens_the_step(part: str):
         "beta": (plain, None),
         "contact stiffness": (plain, SOFT),
         "sticking friction": (plain, SOFT._replace(stiffness=2e7)),
-        "alpha with contact": (plain, SOFT._replace(stiffness=2e8)),
+        "alpha with contact": (plain, SOFT._replace(stiffness=3e7)),
         "beta with contact": (plain, SOFT._replace(stiffness=2e8)),
     }[part]
     assert stable_dt(model, contact) < 0.95 * stable_dt(*without)
 
 
-@pytest.mark.parametrize("law", [SOFT._replace(damping=5e4), SOFT._replace(stiffness=1e6, friction=50.0)])
+@pytest.mark.parametrize("law", [SOFT._replace(damping=2e4), SOFT._replace(stiffness=1e6, friction=50.0)])
 def test_implicit_contact_asks_for_no_shorter_step(law: ContactLaw):
-    """Damping of any size, and stiffness up to a hold of 7: stable at the step of the organ alone."""
+    """Damping up to a hold of 55 (here 39), and stiffness up to one of 16: stable at the step of the organ alone."""
     model = organ()
     assert stable_dt(model, law) == model.stable_step
     assert growth(model, law, 0.95 * model.stable_step) < 30.0

@@ -196,9 +196,9 @@ def test_stable_just_below_and_unstable_beyond(part: str):
 
 
 def test_the_stable_step_counts_supports_and_contact_together():
-    # Implicit contact costs nothing up to about 4e8 N/m^3 here.
+    # Contact this stiff takes its part at any step, the floor the other.
     law = ContactLaw(stiffness=1e9, damping=0.0, friction=0.0, tangential_stiffness=1e8)
-    held, free = free_block(FLOOR, law=SupportLaw(1e8, 0.0)), free_block()
+    held, free = free_block(FLOOR, law=SupportLaw(5e7, 0.0)), free_block()
     assert stable_dt(held, law) < 0.95 * min(stable_dt(held), stable_dt(free, law))
     assert stable_dt(free) > 1.5 * stable_dt(held)
 

@@ -320,7 +320,8 @@ class Coupled:
         self.state: OrganState = rest_state(model, shape_count=1)
         self.wrench: FloatArray = np.zeros((1, 6))
         self._ground = BLOCK[2] + float(ball.shapes.shape_radius[0])
-        self._count = substeps_needed(HAPTIC_STEP, stable_dt(model, contact))
+        # Tissue squeezed by the heaviest ball is stiffer than at rest: one substep more.
+        self._count = substeps_needed(HAPTIC_STEP, stable_dt(model, contact)) + 1
 
     def step(self) -> None:
         """Advance by one haptic step.

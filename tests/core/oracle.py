@@ -294,10 +294,14 @@ def ball(centre: ArrayLike, radius: float, *, velocity: ArrayLike = (0.0, 0.0, 0
 def contact_forces(
     model: OrganModel, state: OrganState, shapes: ContactShapes, law: ContactLaw
 ) -> tuple[FloatArray, FloatArray]:
-    """The kernel's contact forces on the nodes [N] (n_node, 3) and wrench on the tool (6,), the state left as it is."""
+    """The kernel's contact forces on the nodes [N] (n_node, 3) and wrench on the tool (6,), the state left as it is.
+
+    In a step so short that the pressure's change within it, which acts on the flat triangles and grows as dt^2, is
+    rounding.
+    """
     bare = without_stiffness(model)._replace(alpha=0.0, gravity=frozen(np.zeros(3)))
     scratch = OrganState(*(array.copy() for array in state))
     moved = ContactShapes(*(array.copy() for array in shapes))
     wrench = np.zeros((1, 6))
-    advance_organ(bare, scratch, moved, law, 1e-9, 1, wrench)
+    advance_organ(bare, scratch, moved, law, 1e-11, 1, wrench)
     return scratch.node_force, wrench[0]

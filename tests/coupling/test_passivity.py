@@ -130,7 +130,7 @@ def test_contact_energy_is_the_oracles(engaged: int):
     state = oracle.deformed_state(model, 5, shape_count=2)
     state.contact_engaged[:] = engaged
     shapes = oracle.single_tool(
-        [[[0.012, 0.01, 0.0245]] * 2, [[0.0, 0.004, 0.0235], [0.03, 0.012, 0.0255]]], [0.006, 0.004]
+        [[[0.012, 0.01, 0.024]] * 2, [[0.0, 0.004, 0.023], [0.03, 0.012, 0.025]]], [0.006, 0.004]
     )
     expected = oracle.contact_energy(model, state.node_position, shapes, 2e7, state.contact_engaged)
     assert expected > 1e-4

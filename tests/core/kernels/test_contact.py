@@ -34,7 +34,7 @@ def test_advance_counts_contact_in_the_stable_step_and_refuses_a_foreign_state()
     advance(model, state, dt=0.999 * limit, shapes=shapes, contact=law)
     # Without shapes nothing touches, and the longer step is fine.
     advance(model, state, dt=0.999 * model.stable_step)
-    with pytest.raises(OrganError, match=r"the state has 2047 nodes.* the organ"):
+    with pytest.raises(OrganError, match=rf"the state has {len(model.node_mass)} nodes.* the organ"):
         advance(oracle.block(), state, dt=1e-5)
 
 
@@ -184,18 +184,21 @@ def test_sliding_friction_is_mu_times_the_normal_force():
 
 
 def test_sticking_friction_is_a_spring_that_remembers():
-    """Below the limit T = -k_t A u: constant at rest, zero again when the ball is back."""
+    """Below the limit T = -k_t A u: constant at rest, zero again when the ball is back.
+
+    Drawn by 2 um: with 0.06 mm^2 a point, the edge of a patch 2.8 mm in radius passes 0.2 points.
+    """
     state, shapes = on_floor(0.5e-3)
     law = FLOOR_LAW._replace(friction=5.0)  # sticks throughout
-    out = move(state, shapes, (0.001, 0.0, 0.0), 20, law)  # 20 um
+    out = move(state, shapes, (1e-4, 0.0, 0.0), 20, law)
     slope = np.diff(out[:, 0])
-    np.testing.assert_allclose(slope, slope[0], rtol=0.02)  # linear
+    np.testing.assert_allclose(slope, slope[0], rtol=2e-3)  # linear
     assert slope[0] < 0.0
     held = move(state, shapes, (0.0, 0.0, 0.0), 500, law)
     np.testing.assert_allclose(held - held[0], 0.0, rtol=0, atol=1e-12 * held[0, 2])  # no creep in 0.5 s
     # Friction is that of a step's end: the 20th step on the way out began with 20 of stretch and counted one ahead.
     assert held[0, 0] == pytest.approx(out[-1, 0] * 20.0 / 21.0, rel=5e-3)
-    move(state, shapes, (-0.001, 0.0, 0.0), 20, law)
+    move(state, shapes, (-1e-4, 0.0, 0.0), 20, law)
     back = move(state, shapes, (0.0, 0.0, 0.0), 1, law)
     assert abs(back[-1, 0]) < 0.01 * abs(out[-1, 0])
 
@@ -249,7 +252,7 @@ def test_the_far_side_of_a_thin_plate_is_not_touched():
     model = thin_plate()
     near = (model.node_rest_position[model.surface_triangles][:, :, 2] > 0.003 - 1e-9).all(axis=1)
     far = (model.node_rest_position[model.surface_triangles][:, :, 2] < 1e-9).all(axis=1)
-    assert near.sum() == far.sum() > 100
+    assert near.sum() == 2 * far.sum() > 200  # nodes in the middle of the near side's squares
     law = ContactLaw(stiffness=2e7, damping=100.0, friction=0.2, tangential_stiffness=1e7)
     state = rest_state(model, shape_count=1)
     shapes = oracle.ball((0.0151, 0.0148, 0.003 + 0.005), 0.005, velocity=(0.0, 0.0, -0.01))

@@ -154,24 +154,25 @@ RIGID_ORGAN = oracle.irregular_organ(3, damping=Damping(alpha=0.0, beta=2e-3))
 # ---- contact ------------------------------------------------------------------------------------------------------
 
 TOP = 0.02  # height of the small block [m]
+# Shafts and boxes stay beyond the reach of the guard, whose place on them is approximate (`guard_kernels.near_axis`).
 SHAPES = {
     "ball": oracle.ball((0.014, 0.011, TOP + 0.0055), 0.007),
     "deep ball": oracle.ball((0.014, 0.011, TOP - 0.003), 0.007),
     "ball near its axis": oracle.ball((0.014, 0.011, TOP + 0.0035), 0.007),
     "capsule's side": oracle.single_tool(
-        [[0.003, 0.009, TOP + 0.004], [0.027, 0.012, TOP + 0.005]], 0.006, centre=(0.01, 0.0, 0.05)
+        [[0.003, 0.009, TOP + 0.005], [0.027, 0.012, TOP + 0.006]], 0.006, centre=(0.01, 0.0, 0.05)
     ),
     "capsule's tip": oracle.single_tool(
         [[0.016, 0.009, TOP + 0.0025], [0.03, 0.03, TOP + 0.06]], 0.006, centre=(0.02, 0.02, 0.04)
     ),
     "ball and shaft": oracle.single_tool(
-        [[[0.01, 0.01, TOP + 0.005]] * 2, [[0.012, 0.01, TOP + 0.003], [0.024, 0.012, TOP + 0.003]]],
+        [[[0.01, 0.01, TOP + 0.006]] * 2, [[0.012, 0.01, TOP + 0.004], [0.024, 0.012, TOP + 0.004]]],
         [0.007, 0.004],
         centre=(0.0, 0.0, 0.05),
     ),
     # Tilted about its length: points below the core, beside it and off its end.
     "rounded box": oracle.single_tool(
-        [[[0.012, 0.013, TOP + 0.0035], [0.024, 0.012, TOP + 0.0038]]],
+        [[[0.012, 0.013, TOP + 0.0045], [0.024, 0.012, TOP + 0.0048]]],
         0.005,
         span=(0.0004, 0.0051, 0.001),
         centre=(0.0, 0.0, 0.05),

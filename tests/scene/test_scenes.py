@@ -72,7 +72,7 @@ def test_substeps_of_a_scene_bear_its_worst_randomisation(name):
 
 
 def test_too_few_substeps_are_refused_with_the_number_needed():
-    with pytest.raises(OrganError, match=r"1 substeps of 1 ms are too long .*timing\.substep_count = 2"):
+    with pytest.raises(OrganError, match=r"1 substeps of 1 ms are too long .*timing\.substep_count = 3"):
         Simulation(load_anatomy(changed(timing__substep_count=1)))
     anatomy = load_anatomy(make_scene("phantom"))
     simulation = Simulation(anatomy)
@@ -132,6 +132,8 @@ def test_no_centre_of_a_lesion_lies_beyond_a_thin_wall():
 def test_mass_scaling_lets_a_scene_do_with_fewer_substeps():
     """A lesion that asks for four substeps runs with three; what was added is told at reset."""
     table = {"timing__mass_scaling": True, "lesion__modulus_ratio": [14.0, 14.0], "lesion__radius": [0.01, 0.01]}
+    # Soft contact: the lesion alone asks for mass.
+    table |= {"contact__stiffness": 1.9e7}
     simulation = Simulation(load_anatomy(changed(**table)))
     anatomy = simulation.anatomy
     organ = anatomy.organ([anatomy.random_lesion(np.random.default_rng(0))])
@@ -157,7 +159,10 @@ def test_added_mass_leaves_room_for_the_strain_of_a_press():
 def test_with_added_mass_fewer_substeps_measure_the_same():
     """8 substeps down to the 3 that 1 % of mass allows: the force of a press over the lesion within 1e-3."""
     anatomy = load_anatomy(
-        changed(lesion__modulus_ratio=[20.0, 20.0], lesion__radius=[0.006, 0.006], timing__substep_count=8)
+        changed(
+            lesion__modulus_ratio=[20.0, 20.0], lesion__radius=[0.006, 0.006], timing__substep_count=8,
+            contact__stiffness=1.9e7,
+        )  # fmt: skip
     )
     lesion = anatomy.random_lesion(np.random.default_rng(1))
 

@@ -189,10 +189,16 @@ def test_contact_excess_is_where_the_amplification_matrix_leaves_the_unit_circle
 
 
 def test_a_wide_stiff_contact_is_stable():
-    """A ball so large that it is a plate, 0.1 mm into the block's whole top, ten times as stiff as the organ."""
+    """A ball so large that it is a plate, 0.1 mm into the block's whole top, ten times as stiff as the organ.
+
+    Up to the hold that takes nothing of the step's limit: the rise of edges makes motions from node to node twice as
+    stiff, and beyond it a plate needs shorter steps than a ball.
+    """
     model = SMALL_ORGANS["anchored"]
     state = rest_state(model, shape_count=1)
     dt = 0.95 * stable_dt(model, STIFF_CONTACT)
+    while contact_hold(model, STIFF_CONTACT, dt)[0] > 16.0:
+        dt *= 0.95
     shapes = oracle.ball((0.015, 0.01, 0.02 - 1e-4 + 1.0), 1.0)
     wrench = np.zeros((1, 6))
     assert advance_organ(model, state, shapes, STIFF_CONTACT, dt, 2000, wrench) == FAULT_NONE

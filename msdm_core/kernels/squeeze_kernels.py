@@ -37,13 +37,13 @@ from msdm_core.kernels.vector_kernels import any_below, keep_lower
 
 # Implicit stiffness of a steep spring over the rise of its tangent, and the share of it that acts on the speed, as a
 # drag; the other part acts on the change of speed, as a mass. Shares of its energy that a free block of stiffening
-# tissue, stretched by 12 %, keeps after 0.1 s: 0.27 with 3 and 1 (all drag), 0.85 to 0.89 with 1 and 0.03 at half of
-# the stable step. Without drag energy grows, since the added mass varies with the strain; with 0.03 it stays below its
-# start up to 0.6 of the stable step, and swings up to 1.27 of it at 0.9.
-STEEP_HOLD, STEEP_DRAG = 1.0, 0.03
+# tissue, stretched by 12 %, keeps after 0.1 s: 0.27 with 3 and 1 (all drag), 0.86 to 0.90 with 1 and 0.025 at 0.59 of
+# the stable step. Without drag energy grows, since the added mass varies with the strain; with 0.025 it keeps to its
+# start up to 0.6 of the stable step, and swings up to 1.3 of it at 0.9.
+STEEP_HOLD, STEEP_DRAG = 1.0, 0.025
 # Springs hold the rise of the volume term too: in a uniform expansion e springs have an energy of 15 mu e^2 / 2, and
 # the volume term of 9 K_t e^2 / 2, so that springs stiffer by this times K_t / mu bound it.
-VOLUME_HOLD = 0.4
+VOLUME_HOLD = 0.5
 # Numbers of a steep spring in `steep_rows`: its direction, dt K, 1 / (1 + dt K (a + b)) with the changes a, b of its
 # ends' speeds by a pull of 1 N, and its pull so far.
 STEEP_WIDTH = 6

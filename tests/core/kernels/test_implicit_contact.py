@@ -82,7 +82,7 @@ def test_momentum_is_exchanged_and_nothing_else():
     """A free block under a spinning, sliding, rough ball: change of momentum = - wrench x time, to rounding."""
     model = oracle.block((0.03, 0.03, TOP), (6, 6, 4))
     state = rest_state(model, shape_count=1)
-    shapes = ball(2e-3, velocity=(0.1, -0.05, -0.1))
+    shapes = ball(velocity=(0.1, -0.05, -0.1))
     shapes.tool_twist[0, 3:] = (3.0, -2.0, 20.0)
     pivot = np.array([0.01, -0.02, 0.05])
     for _ in range(50):

@@ -95,11 +95,12 @@ def test_a_shaft_on_its_side_does_not_pass_through(tilt: float, aside: float):
     force = []
     with pytest.raises(OrganDivergedError, match=r"turned inside out|contact lost") as end:
         for _ in range(400):
+            # A fault leaves tets inside out, in which any point may lie: the last state without one counts.
+            before, ends = state.node_position.copy(), shapes.shape_ends[0].copy()
             force.append(step(model, state, shapes, phantom().scene.contact.law, 4)[2])
+    state.node_position[:] = before
     assert rises(np.array(force[:-20])) and force[-1] > 0.8 * max(force) and max(force) > 0.9
-    assert "contact lost" in str(end.value) or not any(
-        holds(model, state, point) for point in np.linspace(*shapes.shape_ends[0], 20)
-    )
+    assert "contact lost" in str(end.value) or not any(holds(model, state, point) for point in np.linspace(*ends, 20))
 
 
 def test_a_hard_lesion_below_does_not_open_the_surface_either():

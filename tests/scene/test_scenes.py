@@ -158,14 +158,8 @@ def test_added_mass_leaves_room_for_the_strain_of_a_press():
 
 def test_with_added_mass_fewer_substeps_measure_the_same():
     """8 substeps down to the 3 that 1 % of mass allows: the force of a press over the lesion within 1e-3."""
-    anatomy = load_anatomy(
-        changed(
-            lesion__modulus_ratio=[20.0, 20.0],
-            lesion__radius=[0.006, 0.006],
-            timing__substep_count=8,
-            contact__stiffness=1.9e7,
-        )  # fmt: skip
-    )
+    table = {"lesion__modulus_ratio": [20.0, 20.0], "lesion__radius": [0.006, 0.006], "contact__stiffness": 1.9e7}
+    anatomy = load_anatomy(changed(timing__substep_count=8, **table))
     lesion = anatomy.random_lesion(np.random.default_rng(1))
 
     def organ_of(case):

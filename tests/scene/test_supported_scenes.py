@@ -79,7 +79,7 @@ def test_a_tool_meets_the_bed_alike_in_both_loops(place: str, instrument: str | 
 
 
 def test_the_bed_is_soft():
-    """3 kN/m under the probe's 0.2 kg (MuJoCo's contacts stiffen with the mass): at rest the bed's push is that times how deep the ball stands in it."""
+    """3 kN/m under the probe's 0.2 kg, as MuJoCo's contacts stiffen with the mass: push over depth at rest."""
     simulated = simulation(tip=BARE)
     instrument = simulated.instrument
     instrument.command_velocity(np.array([0.0, 0.0, -0.02]))

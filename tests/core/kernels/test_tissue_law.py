@@ -282,7 +282,7 @@ def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
     law = replace(LIVER, tangent_cap=36.0)
     organs = [block(law, poisson_ratio=0.4, youngs_modulus=modulus) for modulus in (5000.0, 6000.0, 7000.0)]
     states = [blank_state(organ, shape_count=1) for organ in organs]
-    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.12), strict=True):
+    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.16), strict=True):
         state.node_position[:] = strained(organ, size).node_position
     balls = []
     for organ, state in zip(organs, states, strict=True):

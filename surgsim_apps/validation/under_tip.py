@@ -226,8 +226,9 @@ def _dome_mesh(scene: Scene, turn: int) -> TetMesh:
     surface = scene.mesh.surface
     assert surface is not None and surface.coarse_cell_size is not None
     points, triangles = _dome_surface()
-    rotation = Rotation.random(random_state=turn).as_matrix()
-    shift = np.random.default_rng(turn).uniform(-0.5, 0.5, 3) * surface.coarse_cell_size
+    random = np.random.default_rng(turn)
+    rotation = Rotation.from_quat(random.normal(size=4)).as_matrix()
+    shift = random.uniform(-0.5, 0.5, 3) * surface.coarse_cell_size
     top = points[triangles].mean(axis=1)[:, 2] > THICKNESS - CURVATURE + np.sqrt(CURVATURE**2 - BASE**2)
     mesh = mesh_surface(
         points @ rotation.T + shift, triangles, cell_size=surface.cell_size,

@@ -48,7 +48,7 @@ def test_files(run, rows):
 
 def test_table_agrees_with_itself(rows):
     assert [int(row["site"]) for row in rows] == list(range(len(rows)))
-    assert len(rows) == 16
+    assert len(rows) == 36
     for row in rows:
         assert float(row["z"]) == pytest.approx(0.03, abs=1e-6)
         assert np.hypot(float(row["normal_x"]), float(row["normal_y"])) < 1e-6
@@ -154,7 +154,7 @@ def test_an_interrupt_during_a_scan_ends_after_the_press_at_hand(monkeypatch):
         ([*COARSE, "--seed", "-1"], "-1"),
         ([*COARSE, "--lesion", "0.03,0.03,0.015,0.008,-8"], "-8"),
         ([*COARSE, "--lesion", "0.03,0.03,0.025,0.008,8"], "30.0, 30.0, 30.0 mm"),
-        ([*COARSE, "--lesion-below", "99,0.015,0.008,8"], "0 to 15"),
+        ([*COARSE, "--lesion-below", "99,0.015,0.008,8"], "0 to 35"),
         ([*COARSE, "--lesion-below", "3,0.007,0.008,8"], "depth"),
         ([*COARSE, "--approach", "down"], "down"),
         ([*COARSE, "--spacing", "nan"], "nan"),

@@ -1,6 +1,11 @@
 """Compiled functions of the organ's substep, for an organ alone or vectorised in lanes."""
 
-from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT, QUADRATURE_WEIGHT
+from msdm_core.kernels.contact_kernels import (
+    QUADRATURE_BARYCENTRIC,
+    QUADRATURE_COUNT,
+    QUADRATURE_RISE,
+    QUADRATURE_WEIGHT,
+)
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
@@ -19,6 +24,7 @@ __all__ = [
     "GROUP",
     "QUADRATURE_BARYCENTRIC",
     "QUADRATURE_COUNT",
+    "QUADRATURE_RISE",
     "QUADRATURE_WEIGHT",
     "SQUEEZED_RATIO",
     "ContactLaw",

@@ -69,7 +69,7 @@ def cell_name(across: int) -> str:
 @lru_cache(maxsize=4)
 def prism_mesh(across: int) -> TetMesh:
     """Prism with `across` cubic cells across its thickness."""
-    return box_mesh(PRISM, np.array((2, 5, 10)) * across // 2)
+    return box_mesh(PRISM, np.array((2, 5, 10)) * across // 2, top_nodes=False)
 
 
 @lru_cache(maxsize=4)
@@ -144,7 +144,7 @@ def fitted_torsion() -> Iterator[Row]:
 def graded_prism() -> Iterator[Row]:
     """The prism with cells of 5 mm in its upper half and of 10 mm below: pulled, and twisted with its ends held."""
     counts = np.array((2, 5, 10)) * GRADED_ACROSS // 2
-    mesh = box_mesh(PRISM, counts, coarsening=2, fine_depth=0.5 * PRISM[2])
+    mesh = box_mesh(PRISM, counts, coarsening=2, fine_depth=0.5 * PRISM[2], top_nodes=False)
     stiffness = assemble_stiffness(linear_organ(mesh, MODULUS))
     fine, coarse = prism(GRADED_ACROSS), prism(GRADED_ACROSS // 2)
     note = f"{mesh.node_count} nodes, {fine[0].node_count} with cells of 5 mm alone; halves of both sizes in series"
@@ -164,7 +164,7 @@ def graded_prism() -> Iterator[Row]:
 
 def beam(across: int, alpha: float = 0.0, rule: str = "lloyd") -> tuple[TetMesh, OrganModel]:
     """Beam with `across` cells across, its root z = 0 held."""
-    mesh = box_mesh(BEAM, np.array((2, 2, 10)) * across // 2)
+    mesh = box_mesh(BEAM, np.array((2, 2, 10)) * across // 2, top_nodes=False)
     root, damping = nodes_at(mesh.points, 0.0), Damping(alpha=alpha)
     material = Material(MODULUS, DENSITY)
     return mesh, compile_organ(OrganSpec(mesh, material, anchors=root, damping=damping, stiffness_rule=rule))

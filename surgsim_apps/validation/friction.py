@@ -8,6 +8,7 @@ import numpy as np
 from msdm_core.arithmetic import matmul
 from msdm_core.kernels import (
     QUADRATURE_BARYCENTRIC,
+    QUADRATURE_RISE,
     QUADRATURE_WEIGHT,
     ContactLaw,
     ContactShapes,
@@ -91,7 +92,9 @@ def coulomb(touch: BallOnOrgan, state: OrganState, shapes: ContactShapes, direct
     corners = state.node_position[model.surface_triangles]
     normal = vector_areas(state.node_position, model.surface_triangles)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
-    offset = np.einsum("qc,tcx->tqx", QUADRATURE_BARYCENTRIC, corners) - shapes.shape_ends[0, 0]
+    rise = np.einsum("tjk,tjx->tkx", model.surface_rise, state.node_position[model.surface_around])
+    points = np.einsum("qc,tcx->tqx", QUADRATURE_BARYCENTRIC, corners)
+    offset = points + np.einsum("qk,tkx->tqx", QUADRATURE_RISE, rise) - shapes.shape_ends[0, 0]
     height = np.einsum("tqx,tx->tq", offset, normal)
     across = offset - height[:, :, None] * normal[:, None]
     chord = np.sqrt(np.maximum(radius**2 - (across**2).sum(axis=2), 0.0))

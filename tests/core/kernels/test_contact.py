@@ -186,7 +186,8 @@ def test_sliding_friction_is_mu_times_the_normal_force():
 def test_sticking_friction_is_a_spring_that_remembers():
     """Below the limit T = -k_t A u: constant at rest, zero again when the ball is back.
 
-    Drawn by 2 um: with 0.06 mm^2 a point, the edge of a patch 2.8 mm in radius passes 0.2 points.
+    Drawn by 2 um: with 0.06 mm^2 a point, the edge of a patch 2.8 mm in radius passes 0.2 points on average. Up to 8 of
+    380 points, 2 %, are at one distance from the middle of the lattice.
     """
     state, shapes = on_floor(0.5e-3)
     law = FLOOR_LAW._replace(friction=5.0)  # sticks throughout

@@ -278,15 +278,15 @@ def test_lanes_move_as_organs_alone(dtype: type):
 
 
 def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
-    """One lane without steep springs, one that needs the fewest sweeps, one the most: wrench and state to the bit."""
+    """One lane without steep springs, one that needs few sweeps, one the most: wrench and state to the bit."""
     law = replace(LIVER, tangent_cap=36.0)
-    organs = [block(law, poisson_ratio=0.4, youngs_modulus=modulus) for modulus in (5000.0, 6000.0, 7000.0)]
+    organs = [block(law, poisson_ratio=0.4, youngs_modulus=modulus) for modulus in (20e3, 6000.0, 7000.0)]
     states = [blank_state(organ, shape_count=1) for organ in organs]
-    for organ, state, size in zip(organs, states, (0.0, 0.04, 0.16), strict=True):
+    for organ, state, size in zip(organs, states, (0.0, 0.02, 0.12), strict=True):
         state.node_position[:] = strained(organ, size).node_position
     balls = []
     # The ball of the strained organ starts deeper: its surface swings away.
-    for organ, state, height in zip(organs, states, (0.0038, 0.0038, 0.003), strict=True):
+    for organ, state, height in zip(organs, states, (0.0038, 0.0037, 0.003), strict=True):
         middles = state.node_position[organ.surface_triangles].mean(axis=1)
         above = middles[middles[:, 2].argmax()] + np.array([0.0, 0.0, height])
         balls.append(round_shapes([[above, above]], [0.004], twist=[[0.0, 0.0, -0.02, 0.0, 0.0, 0.0]]))
@@ -305,7 +305,7 @@ def test_lanes_that_are_pressed_with_steep_springs_move_as_organs_alone():
             np.testing.assert_array_equal(pushes[lane], wrench)
             tangent = 1.0 + float(state.node_steepness[organ.spring_nodes].mean(axis=1).max())
             needed[lane] = max(needed[lane], steep_sweeps(tangent) if tangent > 1.0 + STEEP_EXCESS else 0)
-    assert (np.diff(needed) > 0.0).all()
+    assert needed[0] == 0.0 and (np.diff(needed) > 0.0).all()
     assert (highest_push > 0.01).all()
     for lane, state in enumerate(states):
         copy = get_lane(together, lane)

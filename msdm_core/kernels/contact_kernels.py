@@ -232,7 +232,8 @@ def press_point(
     weighted_area = rest_area[triangle] * QUADRATURE_WEIGHT
     item = triangle * QUADRATURE_COUNT + point
     weights = row_of(QUADRATURE_BARYCENTRIC, point)
-    place = risen(_mean(position, corners, weights), rise, point)
+    flat = _mean(position, corners, weights)
+    place = risen(flat, rise, point)
     near = closest_on_core(shapes, shape, place)
     away = minus(place, near)
     t = scalar_product(away, normal)
@@ -264,10 +265,11 @@ def press_point(
     tb = turn * turn_b
     tc = turn * turn_c
 
-    # Friction: a tangential spring moving with the surface and turning with the tool.
+    # Friction: a tangential spring moving with the surface and turning with the tool; it pulls at the corners, so
+    # that both velocities are those on the flat triangle.
     stretch = row_of(stretch_memory[shape], item)
     turning = vector_product(part_of_row(shapes.tool_twist, tool, 3), stretch)
-    relative = plus(_mean(velocity, corners, weights), minus(turning, tool_velocity(shapes, tool, place)))
+    relative = plus(_mean(velocity, corners, weights), minus(turning, tool_velocity(shapes, tool, flat)))
     longest = friction * pressure / law.tangential_stiffness
     stretch = stick_or_slip(stretch, relative, dt, out, longest)
     set_row(stretch_memory[shape], item, 0, stretch)
@@ -332,6 +334,7 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 continue
             facet, rise = facet_of(position, surface, triangle), rise_of(position, model, triangle)
             push_a, push_b, push_c = _NONE, _NONE, _NONE
+            before = count
             for point in range(QUADRATURE_COUNT):
                 if not press_point(
                     position, velocity, rest_area, engaged, stretch_memory, rows, places, shapes, law, dt, shape,
@@ -350,7 +353,8 @@ def add_contact_forces(model, state, shapes, law, dt, candidate_count, reference
                 push_b = shifted(push_b, QUADRATURE_RISE[point, 1], along)
                 push_c = shifted(push_c, QUADRATURE_RISE[point, 2], along)
                 count += 1
-            push_around(position, force, reference, wrench, tool, model, triangle, (push_a, push_b, push_c))
+            if count > before:
+                push_around(position, force, reference, wrench, tool, model, triangle, (push_a, push_b, push_c))
     return count
 
 
@@ -464,6 +468,7 @@ def hold_contact(model, state, shapes, law, dt, decay, row_count, reference, wre
     and Voroshilov 2012). The velocities are then those of larger masses, which are symmetric: contact gives no energy,
     and `stability.contact_excess` bounds its part of the step's limit.
     At rest under balanced forces nothing is added: an equilibrium does not depend on dt.
+    Rates and pushes are those at the corners, without the rise of the edges: a symmetric part of the exact slope.
     A pressure does not become negative; friction is at most mu times the final pressure (Coulomb). Tools keep their
     velocity at the start of the substep.
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, vstack
+from scipy.sparse import coo_array, csc_array, csr_array, vstack
 from scipy.sparse.linalg import spsolve
 
 from msdm_core.kernels import SQUEEZED_RATIO, OrganModel, OrganState, evaluate_forces
@@ -273,7 +273,7 @@ class OrganBlock:
             members = np.concatenate([members, springs + tets + np.arange(len(position))])
             shares = np.repeat([0.5, 0.25, 1.0], [2 * springs, 4 * tets, len(position)])
             shape = (len(position), len(strain))
-            sums = coo_array((shares * (linear * strain)[members], (ends, members)), shape=shape).tocsr() @ changes
+            sums = csr_array(coo_array((shares * (linear * strain)[members], (ends, members)), shape=shape) @ changes)
             slope = 2.0 * model.node_softness * (self.stiffening.tangent(equivalent) - factor) / equivalent**2
             total = total + sums.T @ sums.multiply(slope[:, None]).tocsr()
         tension = stiffness * strain

@@ -6,7 +6,7 @@ cells at random places on the lattice.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -203,10 +203,7 @@ def _dome_run(scene: Scene, turn: int, hidden: Hidden | None) -> list[Pressed]:
     mesh, material = _dome_mesh(scene, turn), scene.material
     lesions: tuple[Lesion, ...] = ()
     if hidden is not None:
-        hard = material.__class__(
-            hidden.ratio * material.youngs_modulus, material.density, material.poisson_ratio,
-            stiffening=material.stiffening,
-        )  # fmt: skip
+        hard = replace(material, youngs_modulus=hidden.ratio * material.youngs_modulus)
         lesions = (Lesion((0.0, 0.0, THICKNESS - hidden.cover - hidden.radius), hidden.radius, hard),)
     floor = np.flatnonzero(np.abs(mesh.points[:, 2]) < 1e-6)
     spec = OrganSpec(mesh, material, scene.capsule, lesions=lesions, anchors=floor, damping=Damping(DOME_ALPHA))

@@ -1,6 +1,8 @@
 """Time of a haptic step under a press by its parts."""
 
+from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -78,9 +80,9 @@ def _figures(name: str, rounds: int) -> list[Figure]:
         simulation.control_step(1)
         return seconds_per_call(simulation.control_step)
 
-    runs = {str(last): lambda last=last: part(last, False) for last in range(len(PARTS))}
+    runs: dict[str, Callable[[], float]] = {str(last): partial(part, last, False) for last in range(len(PARTS))}
     if organ.relaxes:
-        runs["fading"] = lambda: part(len(PARTS) - 1, True)
+        runs["fading"] = partial(part, len(PARTS) - 1, True)
     times = interleaved({**runs, "substeps": substeps, "all": steps}, rounds)
     middle = {key: median(values) for key, values in times.items()}
     sums = [middle[str(last)] for last in range(len(PARTS))]

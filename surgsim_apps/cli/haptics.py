@@ -38,8 +38,8 @@ FLAGS = ("fresh", "clamped", "slewed", "approaching", "speed_limited", "workspac
 class Haptics:
     """Let a haptic device hold the instrument in real time: a bridge on this machine over UDP, or a recorded file.
 
-    docs/haptics.md describes the packets. An organ too slow for 1 kHz gets coarser cells, with their force error printed.
-    Ctrl-C ends it; it then prints rate, lateness and packet counts.
+    docs/haptics.md describes the packets. An organ too slow for 1 kHz gets coarser cells, with their force error
+    printed. Ctrl-C ends it; it then prints rate, lateness and packet counts.
     """
 
     scene: SceneName = "liver"

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from msdm_core.material.tissue_law import Relaxation, Stiffening
 from msdm_core.mesh.tet_mesh import TetMesh
@@ -144,3 +145,13 @@ def test_steep_tissue_keeps_its_substeps_unless_it_relaxes(relaxation):
     organ = live.live_organ(scene, OrganChoice(lesions=NONE), Machine(load=0.1))
     timing = organ.anatomy.scene.timing
     assert timing.mass_scaling and (timing.substep_count == 12) == (relaxation is None)
+
+
+def test_commands_warn_of_faults(monkeypatch):
+    anatomy = load_anatomy(make_scene("phantom_small"))
+    slow = live.LiveOrgan(anatomy, load=1.5, force_error=np.array([0.02, -0.2]), node_count=10_000)
+    monkeypatch.setattr(live, "live_organ", lambda scene, choice: slow)
+    console = Console(record=True, quiet=True)
+    with pytest.warns(UserWarning) as said:
+        assert live.live_anatomy(anatomy.scene, NONE, console) is anatomy
+    assert len(said) == len(slow.faults) == 2

@@ -26,7 +26,7 @@ from surgsim_env.scene import (
 )
 
 # Largest processor time of a press over its simulated time; the remainder is for hand, pictures and jitter.
-LOAD_MOST = 0.7
+LOAD_MOST = 0.6
 # Largest share of added mass. Steep tissue that does not relax keeps its substeps: on fewer a liver chatters.
 MASS_SHARE = 0.03
 # Power of the cells' edge with which the load falls about: 2 by the nodes of the face, the others by substeps. Least

@@ -23,9 +23,11 @@ def check_draws(env, seeds):
         cosine = views[0] @ views[1] / np.linalg.norm(views[0]) / np.linalg.norm(views[1])
         assert math.degrees(math.acos(min(cosine, 1.0))) <= 5.0
         assert 0.015 <= draw.target[1] <= 0.030
-        points = env.simulation.organ_state.node_position
-        top = points[env.task.tracked_nodes[:5]]
-        np.testing.assert_allclose(top[:, 1], 0.052 * draw.scale, atol=0.002)
+        edge = env.task.tracked_nodes[:5]
+        rest = env.simulation.organ_model.node_rest_position[edge]
+        np.testing.assert_allclose(rest[:, 1], 0.052 * draw.scale, rtol=1e-12)
+        sag = rest[:, 2] - env.simulation.organ_state.node_position[edge, 2]
+        assert (0.0 < sag).all() and (sag < 0.012 * draw.scale).all(), "lower than at rest, by less than the thickness"
         drawn.append(draw)
     return drawn
 

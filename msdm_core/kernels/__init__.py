@@ -7,6 +7,7 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO
+from msdm_core.kernels.part_kernels import repeat_parts
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
     ContactLaw,
@@ -37,4 +38,5 @@ __all__ = [
     "evaluate_forces",
     "lane_counts",
     "register_bits",
+    "repeat_parts",
 ]

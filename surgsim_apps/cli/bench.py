@@ -50,9 +50,9 @@ class Bench:
 
 def measured_parts() -> "tuple[Callable[[Effort], Section], ...]":
     """Measurements of the sections, in the order of the report."""
-    from surgsim_apps.bench import control, haptic, side_by_side, start, substeps, training
+    from surgsim_apps.bench import control, haptic, parts, side_by_side, start, substeps, training
 
     return (
-        *(substeps.measure, substeps.measure_laws, haptic.measure),
+        *(substeps.measure, substeps.measure_laws, haptic.measure, parts.measure),
         *(control.measure, training.measure, side_by_side.measure, start.measure),
     )

@@ -183,6 +183,8 @@ def _first_scene(
             face_margin=tip,
             site_spacing=_rounded(LAYOUT.spacing_per_tip * tip, LAYOUT.spacing_step),
         ),
+        # Its number of substeps is that of the organ alone at first (`_substeps_of_worst`).
+        timing=replace(liver.timing, mass_scaling=False),
         lesion=None,
         demonstration=(),
         regions=tuple(TissueRegion(name, region.material, name in patient.lesions) for name, region in regions.items()),

@@ -30,8 +30,8 @@ class Follower:
 
 @pytest.mark.slow
 def test_fewer_substeps_feel_the_same():
-    """A press into the liver in 3 substeps instead of 5, all the way in and half the way out."""
-    scene = make_scene("liver")
+    """A press into the kidney in fewer substeps than 7, all the way in and half the way out."""
+    scene = make_scene("kidney_family")
     fewer = live_scene(scene)
     assert fewer.timing.substep_count < scene.timing.substep_count
     forces = []
@@ -43,7 +43,7 @@ def test_fewer_substeps_feel_the_same():
         simulation.reset(organ, path(0.0))
         loop = HapticLoop(simulation, Follower(path), HapticSettings())
         forces.append([np.linalg.norm(loop.step().tips[0].contact_force) for _ in range(3000)])
-    assert max(forces[0]) > 0.3
+    assert max(forces[0]) > 0.1
     np.testing.assert_allclose(forces[1], forces[0], atol=0.001 * max(forces[0]))
 
 

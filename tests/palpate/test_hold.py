@@ -37,7 +37,7 @@ def bean(anchor):
         palpation=replace(
             liver.palpation, press_depth=0.0045, face_margin=0.008, thickness_smallest=0.02, site_spacing=0.009
         ),
-        timing=replace(liver.timing, substep_count=4),
+        timing=replace(liver.timing, substep_count=4, mass_scaling=False),
     )
     return anatomy_of(scene, BEAN)
 

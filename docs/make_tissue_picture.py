@@ -1,6 +1,7 @@
 """Make the picture of docs/real_tissue.md: python docs/make_tissue_picture.py (some minutes)."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -29,10 +30,7 @@ def press(material: Material, speed: float, *, lesion: bool) -> tuple[FloatArray
     """Depths [m] and forces [N] of a press at a speed [m/s]."""
     mesh = box_mesh(SIZE, CELLS)
     middle, top = SIZE[0] / 2.0, SIZE[2]
-    stiff = Material(
-        RATIO * material.youngs_modulus, material.density, material.poisson_ratio, material.stiffening,
-        material.relaxation,
-    )  # fmt: skip
+    stiff = replace(material, youngs_modulus=RATIO * material.youngs_modulus)
     hidden = Lesion((middle, middle, top - COVER - LESION_RADIUS), LESION_RADIUS, stiff)
     organ = compile_organ(
         OrganSpec(

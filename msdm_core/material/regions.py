@@ -282,8 +282,8 @@ def _barycentric_lattice(per_edge: int) -> FloatArray:
 _BARYCENTRIC_SAMPLES = _barycentric_lattice(SAMPLES_PER_EDGE)
 
 
-# Up to this Poisson's ratio the volume term belongs to each tet. Above it tets lock in bending (a cosine load on few
-# cells: 1.48 x too stiff at 0.49, 1.17 x at 0.25) and below a tip, so the excess is averaged at nodes.
+# Up to this Poisson's ratio the volume term belongs to each tet. Above it tets lock in bending (a cosine load on
+# three cells: 1.46 x too stiff at 0.49, 1.06 x at 0.25) and below a tip, so the excess is averaged at nodes.
 POISSON_RATIO_PER_TET = 0.35
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from msdm_core.kernels import GROUP, lane_counts, register_bits
 from surgsim_apps.reports.output_folder import OutputFolder
 from surgsim_env.coupling import core_count
+from surgsim_env.scene import PHYSICS_VERSION
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
 REPORT_NAME = "benchmarks.md"
@@ -64,6 +65,7 @@ def describe(load_before: str) -> str:
         f"machine: {core_count()} cores of {processor()}, {platform.system()} {platform.machine()}",
         registers(),
         f"load average (1 min): {load_before} at the start, {load()} at the end; this run makes about 1 itself",
+        f"physics {PHYSICS_VERSION}",
         f"Python {platform.python_version()}; " + ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         f"date: {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     ]

@@ -19,10 +19,12 @@ from surgsim_apps.haptics.pacing import TIMING, Pacer, PaceSettings, timeliness
 from surgsim_apps.haptics.settings import BREATH_BIT, HapticSettings
 from surgsim_apps.haptics.trajectory import TrajectoryDevice
 from surgsim_apps.haptics.udp import PORT, UdpCounts, UdpDevice
+from surgsim_apps.live.live_organ import live_anatomy
+from surgsim_apps.live.organ_choice import SHOWN
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_env.coupling import Simulation
 from surgsim_env.instruments import parked_place
-from surgsim_env.scene import list_motions, load_anatomy, make_scene, pair_names, with_motion
+from surgsim_env.scene import list_motions, make_scene, pair_names, with_motion
 
 TELEMETRY_NAME = "telemetry.csv"
 VECTORS = ("target", "tip", "coupling_force", "force", "contact_force")
@@ -36,7 +38,8 @@ FLAGS = ("fresh", "clamped", "slewed", "approaching", "speed_limited", "workspac
 class Haptics:
     """Let a haptic device hold the instrument in real time: a bridge on this machine over UDP, or a recorded file.
 
-    docs/haptics.md describes the packets. Ctrl-C ends it; it then prints rate, lateness and packet counts.
+    docs/haptics.md describes the packets. An organ too slow for 1 kHz gets coarser cells, with their force error
+    printed. Ctrl-C ends it; it then prints rate, lateness and packet counts.
     """
 
     scene: SceneName = "liver"
@@ -75,8 +78,8 @@ class Haptics:
             raise ValueError(f"--apnoea: the patient of scene {scene.name!r} does not breathe; give --motion {breaths}")
         if pair_names(scene.instrument.model) is not None:
             raise ValueError(f"scene {scene.name!r} has two arms; one device holds one tip: choose a scene with one")
-        simulation = Simulation(load_anatomy(scene))
-        anatomy = simulation.anatomy
+        anatomy = live_anatomy(scene, SHOWN, console)
+        simulation = Simulation(anatomy)
         simulation.hold_breath(self.apnoea)
         simulation.reset(anatomy.organ(anatomy.demonstration_lesions()), parked_place(anatomy))
         with _device(self, simulation.haptic_dt) as device:

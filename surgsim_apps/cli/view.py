@@ -19,7 +19,8 @@ BIMANUAL_SCENE, BIMANUAL_INSTRUMENT = "lobe", "psm_pair"
 class View:
     """Serve a scene live to a browser: press the organ with mouse, keys or gamepad, a thousand steps a second.
 
-    Prints the address to open on this machine; other machines use an SSH tunnel. See docs/live.md.
+    Prints the address to open on this machine; other machines use an SSH tunnel. An organ too slow for that rate gets
+    coarser cells, with their force error printed. See docs/live.md.
     """
 
     scene: MaybeScene = None
@@ -46,6 +47,8 @@ class View:
         """
         with missing_packages("view", "live"):
             import viser  # noqa: F401
+        from surgsim_apps.live.live_organ import live_anatomy
+        from surgsim_apps.live.organ_choice import lesion_kinds
         from surgsim_apps.live.page import Page
         from surgsim_apps.live.session import Session
 
@@ -62,8 +65,7 @@ class View:
         # A folder that cannot be written is refused before a recording is lost.
         with output_folder(self.out):
             pass
-        console.print(f"{scene.name}: meshing, and compiling if that was not done before ...", highlight=False)
-        session = Session(scene)
+        session = Session(live_anatomy(scene, lesion_kinds(scene)[0], console))
         page = None
         try:
             session.wait()

@@ -6,7 +6,7 @@ import numpy as np
 
 from msdm_core.kernels import OrganModel
 from msdm_core.material import Lesion
-from surgsim_env.scene import Anatomy, Scene, load_anatomy, with_added_mass
+from surgsim_env.scene import Anatomy, Scene
 
 SHOWN, HIDDEN, NONE = "as in the scene", "hidden", "none"
 
@@ -30,19 +30,6 @@ class OrganChoice:
     lesion_ratio: float | None = None
     lesion_size: float = 1.0
     seed: int = 0
-
-
-def live_scene(scene: Scene) -> Scene:
-    """The scene with mass scaling and the fewest substeps for a little added mass (`with_added_mass`).
-
-    Fewer substeps leave time in each haptic step for drawing; mass scaling (`timing.mass_scaling`) also covers the
-    stiffer organs of the sliders.
-
-    Raises:
-        ValueError: a scene without a valid mesh.
-    """
-    choice = OrganChoice(lesions=lesion_kinds(scene)[0])
-    return with_added_mass(load_anatomy(scene), lambda anatomy: [chosen_organ(anatomy, choice)]).scene
 
 
 def lesion_kinds(scene: Scene) -> tuple[str, ...]:

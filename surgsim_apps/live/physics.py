@@ -35,7 +35,7 @@ from surgsim_apps.live.organ_choice import OrganChoice, chosen_organ
 from surgsim_env.coupling import Simulation
 from surgsim_env.instruments import CONTACT_GROUP, ArmInstrument, Instrument, Pair
 from surgsim_env.rendering import shown_geoms
-from surgsim_env.scene import Anatomy, Scene, load_anatomy
+from surgsim_env.scene import Anatomy
 
 # Steps between frames for the page, and between checks of the parent process and of requests.
 FRAME_STEPS, LOOK_STEPS = 16, 8
@@ -128,11 +128,10 @@ class Physics:
     """A simulation with tips after the page's hands: steps, frames, and requests between steps."""
 
     def __init__(
-        self, scene: Scene, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection
+        self, anatomy: Anatomy, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection
     ) -> None:
-        """Load the scene, compile the first organ, and couple the hands."""
-        self._exchange, self._requests = exchange, requests
-        self._anatomy = load_anatomy(scene)
+        """Compile the first organ, and couple the hands."""
+        self._exchange, self._requests, self._anatomy = exchange, requests, anatomy
         self._simulation = Simulation(self._anatomy)
         self._organ: OrganModel = chosen_organ(self._anatomy, choice)
         self._organ_number = 1
@@ -295,7 +294,7 @@ NICENESS = -10
 
 
 def run_physics(
-    scene: Scene, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection, parent: int
+    anatomy: Anatomy, choice: OrganChoice, pace: PaceSettings, exchange: Exchange, requests: Connection, parent: int
 ) -> None:
     """Run the child process; it ends on request, or when the process with the id `parent` has ended.
 
@@ -305,7 +304,7 @@ def run_physics(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _raise_priority()
     try:
-        physics = Physics(scene, choice, pace, exchange, requests)
+        physics = Physics(anatomy, choice, pace, exchange, requests)
     except (ValueError, OSError) as error:
         with contextlib.suppress(OSError):
             requests.send(str(error))

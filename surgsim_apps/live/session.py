@@ -25,11 +25,11 @@ from surgsim_apps.live.exchange_records import (
     new_exchange,
 )
 from surgsim_apps.live.messages import HandMotion
-from surgsim_apps.live.organ_choice import OrganChoice, lesion_kinds, live_scene
+from surgsim_apps.live.organ_choice import OrganChoice, lesion_kinds
 from surgsim_apps.live.physics import home_of, run_physics
 from surgsim_env.coupling import Simulation
 from surgsim_env.rendering import shown_geoms
-from surgsim_env.scene import Scene, load_anatomy
+from surgsim_env.scene import Anatomy
 
 # Updates of the hands [1/s], and the duration of a key or stick after its last message [s].
 BEAT_RATE, HELD = 100.0, 0.15
@@ -53,23 +53,22 @@ class Session:
     """
 
     def __init__(
-        self, scene: Scene, *, pace: PaceSettings | None = None, clock: Callable[[], float] = time.monotonic
+        self, anatomy: Anatomy, *, pace: PaceSettings | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Start the process; `wait` returns when it steps.
 
         Args:
-            scene: the scene that is shown.
+            anatomy: what is shown.
             pace: of the haptic steps; one a haptic step of the scene by default.
             clock: for the durations of keys and sticks [s].
 
         Raises:
-            ValueError: a scene without a valid mesh or instrument.
+            ValueError: a scene without a valid instrument.
         """
-        self.scene = live_scene(scene)
-        self.anatomy = load_anatomy(self.scene)
+        self.anatomy, self.scene = anatomy, anatomy.scene
         self.instrument = Simulation(self.anatomy).instrument
         self.parked = np.atleast_2d(home_of(self.anatomy, self.instrument)).copy()
-        self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
+        self.choice = OrganChoice(lesions=lesion_kinds(self.scene)[0])
         self.directions = np.eye(3)
         self.geoms = shown_geoms(self.instrument.model)
         self.exchange: Exchange = new_exchange(len(self.parked), self.anatomy.mesh.node_count, len(self.geoms))
@@ -83,7 +82,7 @@ class Session:
         pace = pace or PaceSettings(period=self.scene.timing.haptic_step)
         self._process = spawn.Process(
             target=run_physics,
-            args=(self.scene, self.choice, pace, self.exchange, child, os.getpid()),
+            args=(anatomy, self.choice, pace, self.exchange, child, os.getpid()),
             name="surgsim physics",
             daemon=True,
         )

@@ -69,8 +69,6 @@ CASES: tuple[Case, ...] = (
     Case("graded punch", punch.graded_punch, slow=True, needs_fem=True),
     Case("graded liver", lattice.graded_liver),
     Case("ball", partial(touch.ball_on_layer, 12, (0.001, 0.002, 0.003, 0.004)), slow=True, needs_fem=True),
-    Case("tissue load", partial(touch.tissue_loads, 12, 0.30), slow=True, needs_fem=True),
-    Case("tissue load, fine", partial(touch.tissue_loads, 18, 0.15), slow=True, needs_fem=True),
     Case("ball, fine", partial(touch.ball_on_layer, 18, (0.0015, 0.002, 0.003, 0.004)), slow=True, needs_fem=True),
     Case("touch, 0.88", partial(touch.sites, 12, 0.008, 0.004, 100, 0.20, 0.03, 0.12), slow=True, needs_fem=True),
     Case("touch, 0.70", partial(touch.sites, 12, 0.010, 0.0051, 100, 0.20, 0.01, 0.04), slow=True, needs_fem=True),

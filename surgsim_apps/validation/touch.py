@@ -17,23 +17,14 @@ from msdm_core.kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.material import Damping, Lesion
 from msdm_core.mesh import FloatArray
 from msdm_core.meshing import box_mesh
-from msdm_core.organ import OrganSpec, advance_or_raise, compile_organ, rest_state, round_shapes, stable_dt, tissue_load
-from surgsim_apps.validation.finite_press import RIGID, PressedLayer, layer_mesh, spring_law
+from msdm_core.organ import OrganSpec, advance_or_raise, compile_organ, rest_state, round_shapes, stable_dt
+from surgsim_apps.validation.finite_press import PressedLayer, layer_mesh, spring_law
 from surgsim_apps.validation.punch import DISC, SIZE, Hidden, modulus_field
-from surgsim_apps.validation.row import Curve, Result, Row, bounded, compare
+from surgsim_apps.validation.row import Curve, Result, Row, compare
 from surgsim_apps.validation.statics import nodes_at
 from surgsim_env.coupling import Simulation
 from surgsim_env.palpation import press
-from surgsim_env.scene import (
-    BlockMesh,
-    MeshSource,
-    Scene,
-    hidden_share,
-    load_anatomy,
-    make_scene,
-    mesh_bias,
-    press_modulus,
-)
+from surgsim_env.scene import BlockMesh, MeshSource, Scene, load_anatomy, make_scene, mesh_bias, press_modulus
 
 REFERENCE = "scikit-fem, axisymmetric, neo-Hookean, rigid tip"
 # Press by the instrument: tolerances, and sites within a cell of the middle, in cells, for a mean over the places of a
@@ -236,33 +227,6 @@ def bias(cells: int, cases: tuple[tuple[float, float], ...]) -> Iterator[Row]:
         )  # fmt: skip
 
 
-def tissue_loads(cells: int, tolerance: float) -> Iterator[Row]:
-    """Largest contact pressure and principal strain under the scene's tip against elements."""
-    scene = phantom(cells)
-    radius, depth = scene.instrument.tip_radius, scene.palpation.press_depth
-    field, mesh = modulus_field(scene.material.youngs_modulus, None), layer_mesh(DISC, SIZE[2], 0.5 * FINE, NEAR)
-    body = PressedLayer(mesh, field, scene.material.poisson_ratio)
-    touch, cell = block(cells, friction=0.0), SIZE[0] / cells
-    loads = []
-    for offset in OFFSETS:
-        state = rest_state(touch.model, shape_count=1)
-        shapes = ball(0.5 * np.array(SIZE[:2]) + cell * np.array(offset), radius)
-        touch.move(state, shapes, (0.0, 0.0, -PRESS_SPEED), round(depth / (PRESS_SPEED * STEP)))
-        touch.move(state, shapes, (0.0, 0.0, 0.0), HOLD_COUNT)
-        load = tissue_load(touch.model, state, shapes, touch.law)
-        loads.append((load.pressure, load.strain))
-    (reference,) = body.presses(radius, (depth,), scene.contact.stiffness)
-    expected = reference.pressure, reference.strain
-    share = cell / math.sqrt(radius * depth)
-    for name, unit, target, measured in zip(("pressure", "strain"), ("Pa", ""), expected, zip(*loads), strict=True):
-        yield compare(
-            f"tissue load, largest {name}, cell / contact radius {share:.2f}", REFERENCE, expected=target,
-            measured=np.mean(measured), tolerance=tolerance, unit=unit,
-            note=f"averages at nodes; {len(OFFSETS)} sites, {min(measured):.3g} to {max(measured):.3g}; tip "
-            f"{1e3 * radius:g} mm pressed {1e3 * depth:g} mm, k_p of the scene in both",
-        )  # fmt: skip
-
-
 def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:
     """Force over a sphere over the force without it, at three places on the lattice, without friction."""
     radius, depth = 0.008, 0.004
@@ -299,14 +263,13 @@ def linear_liver() -> Scene:
 def liver_contrast() -> Iterator[Row]:
     """Contrast of a slab with the scene liver's tissue without stiffening, its capsule, cells and contact.
 
-    Against a rigid tip: sphere of 20 mm under 5 mm, 6 times as stiff, tip 12 mm, pressed 3, 5 and 7 mm; then the share
-    hidden by the scene's contact, by the same elements.
+    Against a rigid tip: sphere of 20 mm under 5 mm, 6 times as stiff, tip 12 mm, pressed 3, 5 and 7 mm.
     """
     scene = linear_liver()
-    assert scene.mesh.surface is not None and scene.capsule is not None
-    tip, cell = scene.instrument.tip_radius, scene.mesh.surface.cell_size
+    assert scene.mesh.surface is not None
+    cell = scene.mesh.surface.cell_size
     measured = _slab_forces(scene, cell, LIVER_SPHERE) / _slab_forces(scene, cell, None) - 1.0
-    healthy, hard = (liver_reference(hidden, RIGID) for hidden in (None, LIVER_SPHERE))
+    healthy, hard = (_liver_reference(hidden) for hidden in (None, LIVER_SPHERE))
     rigid = hard / healthy - 1.0
     for number, depth in enumerate(LIVER_DEPTHS):
         yield compare(
@@ -316,28 +279,16 @@ def liver_contrast() -> Iterator[Row]:
             note=f"slab of {SLAB_COUNT[0]} x {SLAB_COUNT[0]} x {SLAB_COUNT[1]} cells of {1e3 * cell:g} mm with "
             f"capsule, k_p {scene.contact.stiffness:g} N/m^3, mean of {len(OFFSETS)} sites",
         )  # fmt: skip
-    soft = liver_reference(LIVER_SPHERE, scene.contact.stiffness)
-    hidden = 1.0 - (soft / liver_reference(None, scene.contact.stiffness) - 1.0) / rigid
-    # n of F ~ d^n by differences of second order.
-    slope = np.gradient(np.log(soft), np.log(LIVER_DEPTHS), edge_order=2) * soft / LIVER_DEPTHS
-    for number, depth in enumerate(LIVER_DEPTHS):
-        formula = hidden_share(float(soft[number]), float(slope[number]), tip, depth, scene.contact.stiffness)
-        yield bounded(
-            f"hidden by contact, the same sphere, pressed {1e3 * depth:g} mm", "scikit-fem, k_p of the scene or rigid",
-            measured=hidden[number], most=0.05,
-            note=f"share of the contrast over 1; the formula of the reports says {formula:.3f}",
-        )  # fmt: skip
 
 
-@lru_cache(maxsize=8)
-def liver_reference(hidden: Hidden | None, contact_stiffness: float) -> FloatArray:
+def _liver_reference(hidden: Hidden | None) -> FloatArray:
     """Forces of the liver's tip at LIVER_DEPTHS on a layer of 8 cm of its tissue with its capsule [N]."""
     scene = linear_liver()
     assert scene.capsule is not None and scene.capsule.thickness is not None
     membrane = scene.capsule.youngs_modulus * scene.capsule.thickness
     field, mesh = modulus_field(scene.material.youngs_modulus, hidden), layer_mesh(0.08, 0.08, 1e-3, (0.016, 0.012))
     body = PressedLayer(mesh, field, scene.material.poisson_ratio, membrane=membrane)
-    return np.array(body.forces(scene.instrument.tip_radius, LIVER_DEPTHS, contact_stiffness))
+    return np.array(body.forces(scene.instrument.tip_radius, LIVER_DEPTHS))
 
 
 def _slab_forces(scene: Scene, cell: float, hidden: Hidden | None) -> FloatArray:

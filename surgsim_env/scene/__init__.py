@@ -37,7 +37,6 @@ from surgsim_env.scene.load import (
     with_instrument,
 )
 from surgsim_env.scene.model import (
-    STABLE_STEP_SHARE,
     Anchor,
     Ball,
     BlockMesh,
@@ -80,7 +79,6 @@ __all__ = [
     "LEVELS",
     "PHYSICS_VERSION",
     "REFERENCE_TIP",
-    "STABLE_STEP_SHARE",
     "STILL",
     "SUPPORT_TIP_RADII",
     "AddedShape",

@@ -347,8 +347,9 @@ def hidden_share(force: float, slope: float, tip_radius: float, press_depth: flo
     Contact yields by p0 / k_p below the middle of the tip, with p0 = 3 F / (2 pi R d) (Hertz 1881); a force with the
     slope F' = dF/dd over the lesion falls by F' p0 / k_p. The force of a press elsewhere falls in proportion to itself,
     so a contrast C loses this share of C - 1. Linear tissue has F' = 1.5 F / d, stiffening tissue more; an organ that
-    yields as a whole has less, but no less under the tip. Finite elements lose 0.7 to 1.3 of this share (`surgsim
-    validate`, rows "hidden by contact"), whole organs over their stiffest lesion 1.2 to 1.4 (`liver`, spleen, kidney).
+    yields as a whole has less, but no less under the tip. Finite elements lose 1.0 to 1.4 of this share (`surgsim
+    validate`, rows "hidden by contact"), whole organs over their stiffest lesion 1.3 to 1.8 (`liver`, spleen, kidney,
+    `phantom`), `phantom_small` 0.7.
 
     Args:
         force: F, of the press over the lesion [N].

@@ -19,7 +19,7 @@ from surgsim_apps.live.session import HAND_SPEED, Session
 from surgsim_apps.live.stage import page_camera
 from surgsim_env.scene.load import make_scene, with_instrument
 from surgsim_env.scene.model import Scene
-from tests.live.served import Clock, wait_until
+from tests.live.served import Clock, on_a_fast_machine, wait_until
 
 WIDTH, HEIGHT = 900, 600
 # Pictures are drawn by the processor that the physics runs on: it goes at a tenth of real time here.
@@ -29,7 +29,7 @@ CANVAS = "document.querySelector('canvas').getBoundingClientRect()"
 
 @contextlib.contextmanager
 def serving(scene: Scene, folder: Path, clock: Callable[[], float] = time.monotonic) -> Iterator[Page]:
-    session = Session(scene, pace=PACE, clock=clock)
+    session = Session(on_a_fast_machine(scene), pace=PACE, clock=clock)
     page, stop = None, threading.Event()
     thread = None
     try:

@@ -13,7 +13,7 @@ from surgsim_apps.live.organ_choice import HIDDEN, OrganChoice
 from surgsim_apps.live.page import Page
 from surgsim_apps.live.session import Session
 from surgsim_env.scene.load import make_scene
-from tests.live.served import PACE, wait_until
+from tests.live.served import PACE, on_a_fast_machine, wait_until
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -24,7 +24,7 @@ from surgsim_apps.live.session import Session
 from surgsim_apps.haptics.pacing import PaceSettings
 from surgsim_env.scene.load import make_scene
 if __name__ == "__main__":
-    session = Session(make_scene("phantom_small"), pace=PaceSettings(period=0.01))
+    session = Session(on_a_fast_machine(make_scene("phantom_small")), pace=PaceSettings(period=0.01))
     session.wait()
     print(session._process.pid, flush=True)
     time.sleep(600)
@@ -54,7 +54,7 @@ def _lives(pid: int) -> bool:
 
 @pytest.mark.slow
 def test_a_physics_that_dies_is_said(tmp_path):
-    session = Session(make_scene("phantom_small"), pace=PACE)
+    session = Session(on_a_fast_machine(make_scene("phantom_small")), pace=PACE)
     page = None
     try:
         session.wait()
@@ -73,7 +73,7 @@ def test_why_the_physics_refused_is_said(monkeypatch):
     monkeypatch.setattr(
         "surgsim_apps.live.session.OrganChoice", lambda lesions: OrganChoice(lesions=HIDDEN, lesion_ratio=1e6)
     )
-    session = Session(make_scene("phantom_small"), pace=PACE)
+    session = Session(on_a_fast_machine(make_scene("phantom_small")), pace=PACE)
     try:
         with pytest.raises(LiveError, match=r"physics' process died: .*step"):
             session.wait()

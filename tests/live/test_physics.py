@@ -23,7 +23,6 @@ from surgsim_apps.live.organ_choice import (
     chosen_lesions,
     chosen_organ,
     lesion_kinds,
-    live_scene,
 )
 from surgsim_apps.live.physics import Physics
 from surgsim_apps.live.stage import COLOURS, FeltMap, colour_levels
@@ -32,6 +31,7 @@ from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import Scene
+from tests.live.served import on_a_fast_machine
 
 ASIDE, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
@@ -40,13 +40,13 @@ class Bench:
     """A physics without a process: its hands are moved, and it is stepped, by the test."""
 
     def __init__(self, scene: Scene | None = None) -> None:
-        self.scene = live_scene(scene or make_scene("phantom_small"))
-        self.anatomy = load_anatomy(self.scene)
+        self.anatomy = on_a_fast_machine(scene or make_scene("phantom_small"))
+        self.scene = self.anatomy.scene
         geoms = shown_geoms(Simulation(self.anatomy).instrument.model)
         self.exchange = new_exchange(1, self.anatomy.mesh.node_count, len(geoms))
         self.pipe, child = multiprocessing.Pipe()
         self.kind = lesion_kinds(self.scene)[0]
-        self.physics = Physics(self.scene, OrganChoice(lesions=self.kind), PaceSettings(), self.exchange, child)
+        self.physics = Physics(self.anatomy, OrganChoice(lesions=self.kind), PaceSettings(), self.exchange, child)
         point, self.normal = self.anatomy.face.project(self.anatomy.mesh.points.mean(axis=0) + UP)
         self.above = point + self.normal * (self.scene.instrument.tip_radius + 0.004)
         self.pressed = point + self.normal * (self.scene.instrument.tip_radius - 0.004)
@@ -189,7 +189,7 @@ def test_nobody_left_ends_it(bench):
 
 
 def test_choices_are_what_they_say():
-    anatomy = load_anatomy(live_scene(make_scene("liver")))
+    anatomy = load_anatomy(make_scene("liver"))
     plain = chosen_lesions(anatomy, OrganChoice())
     assert [lesion.name for lesion in plain] == [lesion.name for lesion in anatomy.demonstration_lesions()]
     changed = chosen_lesions(anatomy, OrganChoice(modulus_factor=2.0, lesion_ratio=3.0, lesion_size=0.5))

@@ -51,7 +51,7 @@ class Organ:
     out: MaybePath = None
     """File for the mesh, a .vtu."""
     youngs_modulus: MaybeNumber = None
-    """Young's modulus of the healthy tissue [Pa]; default: by the organ's name, else the liver's."""
+    """Young's modulus of the healthy tissue at equilibrium [Pa]; default: by the organ's name, else the liver's."""
     modulus: tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=PASCAL")]] = ()
     """Young's modulus of a region; default: by its name."""
     approach: MaybeText = None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from msdm_core.errors import MeshError
 from msdm_core.material import Material
+from surgsim_env.scene import make_material
 
 # A common textbook value for soft organs [kg/m^3], not checked against a source.
 DENSITY = 1060.0
@@ -21,15 +22,23 @@ class TissueMaterial:
     source: str
 
 
-# Young's moduli of healthy tissue [Pa].
-ORGANS: Mapping[str, tuple[float, str]] = {
+# Material of the library with the relaxation of ORGANS.
+RELAXING = "pig_liver_ex_vivo_relaxing"
+# Young's moduli of healthy tissue at equilibrium [Pa], and true for tissue that relaxes.
+ORGANS: Mapping[str, tuple[float, bool, str]] = {
     "liver": (
-        5000.0,
-        "chosen; normal liver by shear-wave elastography 6.63 +- 1.65 kPa (doi 10.1177/8756479317733713)",
+        2140.0,
+        True,
+        "elastography measures the immediate modulus, 3.1 times as large: normal liver 6.63 +- 1.65 kPa "
+        "(doi 10.1177/8756479317733713)",
     ),
-    "kidney": (8000.0, "chosen below the 10.2 kPa that elastography takes for the limit of health (PMC10403462)"),
-    "stomach": (5000.0, "chosen as the liver's, filled with tissue; no source was looked up"),
-    "spleen": (5000.0, "chosen as the liver's; no source was looked up"),
+    "kidney": (
+        8000.0,
+        False,
+        "chosen below the 10.2 kPa that elastography takes for the limit of health (PMC10403462)",
+    ),
+    "stomach": (5000.0, False, "chosen, filled with tissue; no source was looked up"),
+    "spleen": (2140.0, True, "chosen as the liver's, with its relaxation; no source was looked up"),
 }
 # Ratio of a lesion's modulus to that of the organ around it.
 LESIONS: Mapping[str, tuple[float, str]] = {
@@ -68,16 +77,16 @@ def without_number(name: str) -> str:
 
 def organ_material(name: str, youngs_modulus: float | None = None) -> TissueMaterial:
     """Material of an organ by its name, such as "left kidney", or with a given modulus [Pa]; else the liver's."""
+    unknown = *ORGANS["liver"][:2], f"the liver's: nothing is known of {name!r} here (--youngs-modulus)"
+    modulus, relaxes, source = _known(name) or unknown
     if youngs_modulus is not None:
         modulus, source = youngs_modulus, GIVEN
-    else:
-        unknown = ORGANS["liver"][0], f"the liver's: nothing is known of {name!r} here (--youngs-modulus)"
-        modulus, source = _known(name) or unknown
-    return TissueMaterial(Material(modulus, DENSITY, POISSON_RATIO), source)
+    relaxation = make_material(RELAXING).material.relaxation if relaxes else None
+    return TissueMaterial(Material(modulus, DENSITY, POISSON_RATIO, relaxation=relaxation), source)
 
 
-def _known(name: str) -> tuple[float, str] | None:
-    """Modulus [Pa] and source of the first organ in a name."""
+def _known(name: str) -> tuple[float, bool, str] | None:
+    """Entry of the first organ in a name."""
     return next((entry for word, entry in ORGANS.items() if word in name.lower()), None)
 
 
@@ -99,7 +108,9 @@ def region_material(name: str, organ_name: str, organ: Material, moduli: Mapping
             if word in name.lower() and word != "lesion":
                 ratio, source = entry
         modulus, source = ratio * organ.youngs_modulus, f"{ratio:g} x the organ's; {source}"
+    elif _known(name):
+        return organ_material(name)
     else:
-        unknown = f"that of the organ around it: nothing is known of {name!r} here (--modulus)"
-        modulus, source = _known(name) or (organ.youngs_modulus, unknown)
+        modulus = organ.youngs_modulus
+        source = f"that of the organ around it: nothing is known of {name!r} here (--modulus)"
     return TissueMaterial(replace(organ, youngs_modulus=modulus), source)

@@ -1,12 +1,13 @@
 """Palpation scene of a patient's organ: tip, press, limits and hidden lesions scaled to its cells and tissue."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from msdm_core.kernels import OrganModel
 from msdm_core.material import Material
 from surgsim_apps.palpate.hold import Hold
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR
@@ -31,6 +32,8 @@ from surgsim_env.scene import (
     contact_radius,
     hertz_force,
     make_scene,
+    press_modulus,
+    with_added_mass,
     with_substeps,
 )
 
@@ -48,8 +51,8 @@ class PalpationLayout:
     """Numbers of the scene in proportion to tip, press and cells, as in the scene liver; the others are chosen.
 
     Fields:
-        contact_share: contact stiffness times contact radius over Young's modulus: hides a few per cent of a contrast
-            over 1
+        contact_share: contact stiffness times contact radius over the modulus that a press feels: hides a few per cent
+            of a contrast over 1
         contact_stiffness_most: what the probe of 0.18 kg bears [N/m^3]
         spacing_per_tip, spacing_step: spacing of sites over the tip's radius, and the step of its rounding [m]
         sites_most: a raster of more sites takes minutes: its spacing is then enlarged
@@ -180,6 +183,8 @@ def _first_scene(
             face_margin=tip,
             site_spacing=_rounded(LAYOUT.spacing_per_tip * tip, LAYOUT.spacing_step),
         ),
+        # Its number of substeps is that of the organ alone at first (`_substeps_of_worst`).
+        timing=replace(liver.timing, mass_scaling=False),
         lesion=None,
         demonstration=(),
         regions=tuple(TissueRegion(name, region.material, name in patient.lesions) for name, region in regions.items()),
@@ -193,7 +198,7 @@ def _first_scene(
 
 def _contact_stiffness(material: Material, radius: float) -> float:
     """Contact stiffness [N/m^3] for a contact radius [m]."""
-    return min(_digits(LAYOUT.contact_share * material.youngs_modulus / radius, 3), LAYOUT.contact_stiffness_most)
+    return min(_digits(LAYOUT.contact_share * press_modulus(material) / radius, 3), LAYOUT.contact_stiffness_most)
 
 
 def _with_sites(scene: Scene, patient: PatientMesh, notes: list[str]) -> tuple[Anatomy, int]:
@@ -251,16 +256,20 @@ def _with_lesions(anatomy: Anatomy, notes: list[str]) -> Anatomy:
 
 
 def _substeps_of_worst(anatomy: Anatomy) -> Anatomy:
-    """The anatomy with the substeps of its stiffest organ: with segmented lesions, a stiffer model, hidden lesions."""
-    scene = anatomy.scene
-    organs = [anatomy.organ(anatomy.demonstration_lesions()), anatomy.organ(modulus_factor=1.0 + MODEL_MODULUS_ERROR)]
-    if scene.lesion is not None:
-        draw, worst = scene.lesion, np.random.default_rng(0)
+    """The anatomy with the fewest substeps for a little mass added to its stiffest organs, healthy and with lesions."""
+    draw, worst = anatomy.scene.lesion, np.random.default_rng(0)
+    lesions = [anatomy.demonstration_lesions()]
+    if draw is not None:
         hardest = replace(
             draw, radius=(draw.radius[1],) * 2, cover=(draw.cover[0],) * 2, modulus_ratio=(draw.modulus_ratio[1],) * 2
         )
-        organs += [anatomy.organ([anatomy.random_lesion(worst, hardest)]) for _ in range(2)]
-    return with_substeps(anatomy, organs)
+        lesions += [[anatomy.random_lesion(worst, hardest)] for _ in range(2)]
+
+    def organs_of(scaled: Anatomy) -> Iterator[OrganModel]:
+        yield from (scaled.organ(balls) for balls in lesions)
+        yield scaled.organ(modulus_factor=1.0 + MODEL_MODULUS_ERROR)
+
+    return with_added_mass(with_substeps(anatomy, [*organs_of(anatomy)]), organs_of)
 
 
 def _pair(share: tuple[float, float], length: float) -> tuple[float, float]:

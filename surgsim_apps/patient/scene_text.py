@@ -29,13 +29,13 @@ def scene_text(organ: PatientScene) -> str:
         "cranial": "where the head is, for motions" if patient.is_scan else "where the head is: chosen, for motions",
         **organ.anchor_sources,
         "mesh.fine_surface": "what pictures and the live page draw; delete it to see the boundary of the tets",
-        "contact.stiffness": "[N/m^3] chosen: 200 E / contact radius, at most 2.5e8",
+        "contact.stiffness": "[N/m^3] chosen: 200 E / contact radius with the E that a press feels, at most 2.5e8",
         "contact.damping": "[N s/m^3] as in the scene liver",
         "contact.friction": "as in the scene liver",
         "instrument.tip_radius": f"[m] chosen with the cells: cell / contact radius {share:.2f}",
         "instrument.approach": "direction of the probe, in the axes above",
         "timing.haptic_step": "[s]",
-        "timing.substep_count": "stable with contact, with all lesions here and the stiffest drawn one",
+        "timing.substep_count": "stable with contact, by a little added mass also with the stiffest lesions",
         "limits": f"[N] chosen: {PALPATION.soft_per_press:g} and {PALPATION.hard_per_press:g} times a healthy press "
         "(Hertz)",
         "sensor": "per axis, as in the scene liver",
@@ -114,8 +114,10 @@ def _tissue_comments(organ: PatientScene, scene: Scene) -> dict[str, str]:
         "damping.beta": "[s]",
     }
     for table in ("material", "regions.material"):
-        comments[f"{table}.youngs_modulus"] = "[Pa]"
+        comments[f"{table}.youngs_modulus"] = "[Pa] at equilibrium"
         comments[f"{table}.density"] = "[kg/m^3] a common textbook value, not checked against a source"
+        comments[f"{table}.relaxation"] = "as pig liver relaxes (scenes/materials/pig_liver_ex_vivo_relaxing.toml)"
+        comments[f"{table}.relaxation.times"] = "[s]"
         comments[f"{table}.poisson_ratio"] = "chosen: nearly incompressible"
     for number, region in enumerate(scene.regions):
         comments[f"regions[{number}].material"] = organ.regions[region.name].source

@@ -76,7 +76,8 @@ class TouchPlan:
 
     def real_time_factor(self, material: Material) -> float:
         """Estimate of simulated time over the processor time of one core, by the modulus and density of a tissue."""
-        speed = math.sqrt(material.youngs_modulus / material.density)
+        stiffest = 1.0 if material.relaxation is None else material.relaxation.instantaneous
+        speed = math.sqrt(stiffest * material.youngs_modulus / material.density)
         substeps = math.ceil(SUBSTEP_CELLS * HAPTIC_STEP * speed / self.cell_size)
         return HAPTIC_STEP / (TIME_PER_TET * TETS_PER_NODE * self.node_count * substeps)
 

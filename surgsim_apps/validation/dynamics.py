@@ -6,6 +6,7 @@ losses, and work of the tool in many presses.
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -218,9 +219,10 @@ def energy_drift() -> Iterator[Row]:
 
 
 def tissue_block(scene: Scene, cells: int, alpha: float) -> OrganModel:
-    """Free cube of the tissue of a scene, without gravity."""
+    """Free cube of the tissue of a scene, without gravity and relaxation, which takes energy."""
     mesh, damping = box_mesh((cells * FREE_CELL,) * 3, (cells,) * 3), Damping(alpha=alpha)
-    return compile_organ(OrganSpec(mesh, scene.material, damping=damping, stiffness_rule=scene.stiffness_rule))
+    material = replace(scene.material, relaxation=None)
+    return compile_organ(OrganSpec(mesh, material, damping=damping, stiffness_rule=scene.stiffness_rule))
 
 
 def stretched_block(model: OrganModel, stretch: float, ratio: float, spin: float = 0.0) -> OrganState:

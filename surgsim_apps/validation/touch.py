@@ -24,7 +24,7 @@ from surgsim_apps.validation.row import Curve, Result, Row, compare
 from surgsim_apps.validation.statics import nodes_at
 from surgsim_env.coupling import Simulation
 from surgsim_env.palpation import press
-from surgsim_env.scene import BlockMesh, MeshSource, Scene, load_anatomy, make_scene, mesh_bias
+from surgsim_env.scene import BlockMesh, MeshSource, Scene, load_anatomy, make_scene, mesh_bias, press_modulus
 
 REFERENCE = "scikit-fem, axisymmetric, neo-Hookean, rigid tip"
 # Press by the instrument: tolerances, and sites within a cell of the middle, in cells, for a mean over the places of a
@@ -247,9 +247,16 @@ def contrast(cells: int, hidden: Hidden) -> Iterator[Row]:
     )  # fmt: skip
 
 
-def linear_liver() -> Scene:
-    """Scene liver without stiffening: the reference is neo-Hookean."""
+def elastic_liver() -> Scene:
+    """Scene liver without relaxation, as stiff as a press feels it, in small substeps: the references are elastic."""
     scene = make_scene("liver")
+    material = replace(scene.material, youngs_modulus=press_modulus(scene.material), relaxation=None)
+    return replace(scene, material=material, timing=replace(scene.timing, substep_count=5, mass_scaling=False))
+
+
+def linear_liver() -> Scene:
+    """`elastic_liver` without stiffening: the reference is neo-Hookean."""
+    scene = elastic_liver()
     return replace(scene, material=replace(scene.material, stiffening=None))
 
 

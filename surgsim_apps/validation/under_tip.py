@@ -19,7 +19,18 @@ from msdm_core.organ import OrganSpec, compile_organ, element_strains, rest_stat
 from surgsim_apps.validation.finite_press import RIGID, Law, Press, PressedLayer, layer_mesh, neo_hookean, spring_law
 from surgsim_apps.validation.punch import DISC, SIZE, Hidden, modulus_field
 from surgsim_apps.validation.row import Row, bounded, compare
-from surgsim_apps.validation.touch import FINE, NEAR, OFFSETS, PRESS_SPEED, STEP, BallOnOrgan, ball, block, phantom
+from surgsim_apps.validation.touch import (
+    FINE,
+    NEAR,
+    OFFSETS,
+    PRESS_SPEED,
+    STEP,
+    BallOnOrgan,
+    ball,
+    block,
+    elastic_liver,
+    phantom,
+)
 from surgsim_env.scene import Scene, hidden_share, make_scene
 
 NEO_HOOKE = "scikit-fem, axisymmetric, neo-Hookean"
@@ -151,7 +162,7 @@ def drags() -> Iterator[Row]:
 
 def dome_presses() -> Iterator[Row]:
     """Presses of a dome with the scene liver's tissue, capsule, cells and contact, healthy and over a hidden sphere."""
-    scene = make_scene("liver")
+    scene = elastic_liver()
     assert scene.mesh.surface is not None
     note = f"{TURNS} random places on the lattice, cell {1e3 * scene.mesh.surface.cell_size:g} mm, k_p of the scene"
     forces, references = [], []
@@ -178,7 +189,7 @@ def dome_presses() -> Iterator[Row]:
 
 def hidden_by_contact() -> Iterator[Row]:
     """Share of a contrast over 1 of the liver's stiffening tissue, hidden by the scene's contact."""
-    scene = make_scene("liver")
+    scene = elastic_liver()
     contrast = []
     for stiffness in (RIGID, scene.contact.stiffness):
         healthy, hard = (_dome_reference(scene, hidden, stiffness) for hidden in (None, DOME_SPHERE))

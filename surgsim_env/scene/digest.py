@@ -14,7 +14,7 @@ from surgsim_env.scene.load import pair_names
 from surgsim_env.scene.model import Scene
 
 # Increase it with each intended change of results; the hashes of tests/test_unchanged.py change with it.
-PHYSICS_VERSION = 2
+PHYSICS_VERSION = 3
 
 
 def content_digest(*parts: object, size: int = 12) -> str:

@@ -23,6 +23,9 @@ OPEN_GAP = 1e-6
 # around its centre on a site.
 SHAFT_RADIUS, TIP_FREE = 0.004, 0.8
 
+# Mean time under load of the tissue at the readings of a press at 0.04 m/s and a hold of 0.1 s [s].
+LOAD_TIME = 0.15
+
 # Largest distance of a ray's hit on its own starting triangle [m].
 HIT_LEAST = 1e-6
 
@@ -326,9 +329,15 @@ def share_text(cell: float, tip_radius: float, press_depth: float) -> str:
     return f"{text}: above {SHARE_LARGEST:g}, the mesh itself is felt" if share > SHARE_LARGEST else text
 
 
+def press_modulus(material: Material) -> float:
+    """Young's modulus that a press feels [Pa]: E (1 + sum_i g_i exp(-t / tau_i)) at t = LOAD_TIME."""
+    arms = material.relaxation
+    return material.youngs_modulus * (1.0 if arms is None else float(arms.remaining(LOAD_TIME)))
+
+
 def hertz_force(material: Material, tip_radius: float, press_depth: float) -> float:
-    """Force of a ball on an elastic half space, F = 4/3 E / (1 - nu^2) R^0.5 d^1.5 (Hertz 1881) [N]."""
-    stiffness = material.youngs_modulus / (1.0 - material.poisson_ratio * material.poisson_ratio)
+    """Force of a ball on a half space of `press_modulus`, F = 4/3 E / (1 - nu^2) R^0.5 d^1.5 (Hertz 1881) [N]."""
+    stiffness = press_modulus(material) / (1.0 - material.poisson_ratio * material.poisson_ratio)
     return 4.0 / 3.0 * stiffness * math.sqrt(tip_radius) * press_depth * math.sqrt(press_depth)
 
 

@@ -105,6 +105,7 @@ def test_a_held_force_is_that_of_finite_elements() -> None:
         lesion=None,
         demonstration=(),
         instrument=replace(liver.instrument, tip_radius=TIP, approach=DOWN),
+        timing=replace(liver.timing, substep_count=5, mass_scaling=False),
         palpation=replace(
             liver.palpation, press_depth=DEPTH, face_margin=TIP, thickness_smallest=0.0, site_spacing=0.016
         ),

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from surgsim_env.coupling.tracking import SurfaceTracker
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import Limits, Scene
 
-# Speed of the tip inward [m/s], rest at depth [s], and averaging time of force at the end of the rest [s].
+# Speed of the tip inward [m/s], longest rest at depth [s], and averaging time of force at the end of the rest [s].
 PRESS_SPEED = 0.04
 HOLD_TIME = 0.10
 AVERAGE_TIME = 0.04
@@ -26,6 +26,8 @@ AVERAGE_TIME = 0.04
 FOLLOWING_TIME = 0.010
 # Interval of the averaged readings of `press_phases` [s]; `recorded_phases` reads in each haptic step.
 READING_TIME = 0.010
+# Number of averaged readings.
+READINGS = round(AVERAGE_TIME / READING_TIME)
 
 # Part of the way inward, in final depths, on which the slope of a press is measured; beyond it the tip brakes.
 SLOPE_DEPTHS = (0.75, 0.97)
@@ -45,6 +47,7 @@ class PressPhase:
         read: True for a reading of force and depth at its end.
         command: haptic steps from the phase's start until the next command of the instrument's velocity; 0 continues
             the previous command.
+        settles: True for a press that ends here if its last READINGS readings agree.
     """
 
     count: int
@@ -52,6 +55,7 @@ class PressPhase:
     force_limit: float
     read: bool = False
     command: int = 0
+    settles: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +63,7 @@ class PressResult:
     """Outcome of a press.
 
     Fields:
-        force: of the tissue on the tip, mean of the readings at the end of the hold [N]           (3,)
+        force: of the tissue on the tip, mean of the last READINGS readings [N]                    (3,)
         depth: of the tip below the rest surface (carried by its ground) along the normal, mean of the same readings [m]
         force_peak: largest contact force of any haptic step [N]
         stopped: True if force ended the motion inward before depth did
@@ -125,15 +129,15 @@ def stop_force(limits: Limits) -> float:
 
 
 def press_phases(scene: Scene) -> tuple[PressPhase, ...]:
-    """Press in few control steps: inward to the scene's depth or `stop_force`, hold, readings READING_TIME apart."""
+    """Press in few control steps: inward to the scene's depth or `stop_force`, and a hold, read every READING_TIME."""
     inward, hold, longest = _step_counts(scene)
-    apart, readings = max(1, round(READING_TIME / scene.timing.haptic_step)), round(AVERAGE_TIME / READING_TIME)
-    hard, stop = scene.limits.hard_force, stop_force(scene.limits)
-    phases = [PressPhase(count, True, stop, command=count) for count in _parts(inward, longest)]
-    before = _parts(hold - (readings - 1) * apart, longest)
-    phases += [PressPhase(count, False, hard, command=count) for count in before]
-    phases[-1] = replace(phases[-1], read=True)
-    return (*phases, *[PressPhase(apart, False, hard, read=True, command=apart)] * (readings - 1))
+    apart = max(1, round(READING_TIME / scene.timing.haptic_step))
+    stop, hard = stop_force(scene.limits), scene.limits.hard_force
+    ways = [PressPhase(count, True, stop, command=count) for count in _parts(inward, longest)]
+    # Tissue that relaxes feels different after a different time.
+    settles = not scene.motions and scene.material.relaxation is None
+    rest = PressPhase(apart, False, hard, read=True, settles=settles, command=apart)
+    return (*ways, *[rest] * (hold // apart))
 
 
 def recorded_phases(scene: Scene) -> tuple[PressPhase, ...]:
@@ -162,6 +166,8 @@ class SitePress:
     """Press in progress: for each phase `begin`, a control step of its simulation, `end`.
 
     `readings` holds force [N] (3,) and depth [m] of each phase with a reading, and of a phase beyond the hard limit.
+    A phase that `settles` ends the press once force, and depth times force over depth, have changed by at most the
+    sensor's noise within AVERAGE_TIME.
     """
 
     def __init__(
@@ -234,11 +240,22 @@ class SitePress:
             surface = self.point + self.simulation.ground_shift(self.point)
             below = matmul(surface - self.simulation.instrument.tip_position, self.normal) + self._radius
             self.readings.append((self.simulation.contact_force, float(below)))
+            self._over |= phase.settles and self._settled()
+
+    def _settled(self) -> bool:
+        """True if the readings of AVERAGE_TIME agree to the noise of the sensor."""
+        last = self.readings[-READINGS:]
+        force = np.array([matmul(force, self.normal) for force, _ in last])
+        depth = np.array([depth for _, depth in last])
+        if len(last) < READINGS or not depth.mean() > 0.0:
+            return False
+        spread = max(np.ptp(force), np.ptp(depth) * force.mean() / depth.mean())
+        return bool(spread <= self.simulation.anatomy.scene.sensor.noise)
 
     def result(self) -> PressResult:
         """Outcome so far; after a fault force and depth are 0."""
         fault = self.simulation.fault
-        readings = self.readings if not fault else [(np.zeros(3), 0.0)]
+        readings = self.readings[-READINGS:] if not fault else [(np.zeros(3), 0.0)]
         return PressResult(
             force=np.mean([force for force, _ in readings], axis=0),
             depth=float(np.mean([depth for _, depth in readings])),

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 
 import surgsim_env  # noqa: F401
+from msdm_core.material import Relaxation
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.palpation import chart as healthy_module
 from surgsim_env.palpation.chart import charted_face, healthy_map, interpolated
-from surgsim_env.palpation.site_press import SitePress, press, press_alone, press_phases, stop_force
+from surgsim_env.palpation.site_press import (
+    HOLD_TIME,
+    PRESS_SPEED,
+    SitePress,
+    press,
+    press_alone,
+    press_phases,
+    stop_force,
+)
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.levels import LEVELS, DrawnOrgan
 from surgsim_env.scene.load import make_scene
@@ -40,18 +49,60 @@ def play(env: gym.Env, seed: int, actions: np.ndarray) -> list[tuple]:
 # ---- the press ------------------------------------------------------------------------------------------------------
 
 
+def full_phases(scene):
+    """Phases of a press with its whole rest."""
+    return tuple(replace(phase, settles=False) for phase in press_phases(scene))
+
+
 def test_a_press_feels_what_the_scan_feels():
     """The same way in and hold; the mean is over four readings in 40 ms instead of forty."""
     simulation = Simulation(small_anatomy())
     site = charted_face(simulation.anatomy).site([0.2, -0.3])
     simulation.reset(simulation.anatomy.organ(), simulation.instrument.parked)
-    result = press_alone(SitePress(simulation, site.point, site.normal), press_phases(simulation.anatomy.scene))
+    result = press_alone(SitePress(simulation, site.point, site.normal), full_phases(simulation.anatomy.scene))
     expected = press(simulation, site.point, site.normal)
     assert not result.stopped and not result.fault and not expected.end
     assert result.force @ site.normal == pytest.approx(expected.force, rel=2e-3)
     assert result.depth == pytest.approx(expected.depth, rel=1e-3)
     assert result.force_peak == pytest.approx(expected.force_peak, rel=1e-12)
     assert result.duration == pytest.approx(expected.duration)
+
+
+def test_a_press_ends_once_its_readings_agree_to_the_noise():
+    """Sooner than its longest rest, with a contrast that changes by much less than the noise of a reading."""
+    anatomy = small_anatomy()
+    scene, simulation = anatomy.scene, Simulation(anatomy)
+    site = charted_face(anatomy).site(MIDDLE)
+    lesion = anatomy.lesion_below(site.point, 0.005, 0.003, 6.0, "hidden")
+
+    def felt(phases):
+        for organ in (anatomy.organ(), anatomy.organ((lesion,))):
+            simulation.reset(organ, simulation.instrument.parked)
+            yield press_alone(SitePress(simulation, site.point, site.normal), phases)
+
+    def contrast(healthy, hard):
+        return (hard.force @ site.normal / hard.depth) / (healthy.force @ site.normal / healthy.depth)
+
+    early, full = list(felt(press_phases(scene))), list(felt(full_phases(scene)))
+    assert all(one.duration < 0.9 * other.duration for one, other in zip(early, full, strict=True))
+    noise = scene.sensor.noise / (early[0].force @ site.normal)
+    assert contrast(*full) > 1.1
+    assert contrast(*early) == pytest.approx(contrast(*full), rel=0.25 * noise)
+
+
+def test_readings_without_noise_and_relaxing_tissue_take_their_full_rest():
+    anatomy = small_anatomy()
+    arms = replace(anatomy.scene.material, relaxation=Relaxation((0.3,), (0.05,)))
+    for scene in (
+        replace(anatomy.scene, sensor=replace(anatomy.scene.sensor, noise=0.0)),
+        replace(anatomy.scene, material=arms),
+    ):
+        simulation = Simulation(replace(anatomy, scene=scene))
+        site = charted_face(anatomy).site(MIDDLE)
+        simulation.reset(simulation.anatomy.organ(), simulation.instrument.parked)
+        result = press_alone(SitePress(simulation, site.point, site.normal), press_phases(scene))
+        whole = (scene.palpation.clearance + scene.palpation.press_depth) / PRESS_SPEED + HOLD_TIME
+        assert result.duration == pytest.approx(whole, abs=2.0 * scene.timing.haptic_step)
 
 
 def test_the_organ_is_at_rest_again_before_the_next_press():

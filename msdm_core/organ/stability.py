@@ -254,7 +254,7 @@ def _held_step(model: OrganModel, held: FloatArray, drag: FloatArray) -> float:
 # ---- mass scaling -------------------------------------------------------------------------------------------------
 
 # Largest added mass, as a share of the organ's.
-ADDED_SHARE_LIMIT = 0.1
+ADDED_SHARE_LIMIT = 0.15
 # Relative accuracy of w^2 in the bisection; largest number of reductions of the first guess by a tenth.
 FREQUENCY_TOLERANCE = 2.0**-6
 LOWERINGS = 20
@@ -267,8 +267,8 @@ def scale_mass(model: OrganModel, step: float, contact: ContactLaw | None = None
     w by bisection to 1 % the largest for a `stable_dt` of at least the step.
 
     Raises:
-        OrganError: an organ under gravity (the added mass would have weight), or more added mass than a tenth of the
-            organ's; names the share.
+        OrganError: an organ under gravity (the added mass would have weight), or more added mass than
+            ADDED_SHARE_LIMIT of the organ's; names the share.
     """
     before = stable_dt(model, contact)
     if before >= step:

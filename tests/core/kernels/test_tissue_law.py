@@ -343,7 +343,7 @@ def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation:
 
 @pytest.mark.parametrize("stretch", [0.12, -0.12])
 def test_a_strained_block_keeps_its_energy_at_the_shipped_step(stretch: float):
-    """At least 0.7 after 0.1 s at 0.6 of the limit; never above the start, to the swing of the scheme.
+    """At least 0.85 after 0.1 s at 0.6 of the limit; never above the start, to the swing of the scheme.
 
     The drag that calms nodes under a held tip (`test_a_held_press_on_the_liver_is_calm`) takes some of it.
     """
@@ -357,7 +357,7 @@ def test_a_strained_block_keeps_its_energy_at_the_shipped_step(stretch: float):
     for _ in range(round(0.11 / dt)):
         advance(model, state, dt=dt)
         energies.append((kinetic_energy(model, state) + stored_energy(model, state)) / begin)
-    assert np.mean(energies[-round(0.02 / dt) :]) > 0.7
+    assert np.mean(energies[-round(0.02 / dt) :]) > 0.85
     assert max(energies) < 1.05
 
 

@@ -44,9 +44,10 @@ if __name__ == "__main__":
 """
 
 
-def hear_ctrl_c() -> None:
-    """Restore the default of SIGINT, which a shell's background jobs ignore."""
+def hear_signals() -> None:
+    """Restore the defaults of SIGINT, which a shell's background jobs ignore, and of SIGHUP, which nohup ignores."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, None])
@@ -55,7 +56,7 @@ def test_a_recording_that_runs_is_written_however_it_ends(tmp_path, how):
     script.write_text(CHILD)
     given = [sys.executable, script, "--out", out, *(["--seconds", "0.2"] if how is None else [])]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    run = subprocess.Popen(given, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=hear_ctrl_c)
+    run = subprocess.Popen(given, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=hear_signals)
     assert run.stdout is not None
     if how is not None:
         assert any(line == "recording\n" for line in run.stdout)

@@ -345,11 +345,12 @@ def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation:
 def test_a_strained_block_keeps_its_energy_at_the_shipped_step(stretch: float):
     """At least 0.85 after 0.1 s at 0.6 of the limit; never above the start, to the swing of the scheme.
 
-    The drag that calms nodes under a held tip (`test_a_held_press_on_the_liver_is_calm`) takes some of it.
+    The law and modulus of `liver`. The drag that calms nodes under a held tip (`test_a_held_press_on_the_liver_is_calm`)
+    takes some of it, more in the same time from stiffer tissue, which swings faster.
     """
-    law = Stiffening(onset_strain=0.0821, cap_strain=0.2447, tangent_cap=52.9)
-    mesh = box_mesh((0.03, 0.03, 0.03), (6, 6, 6))
-    model = compile_organ(OrganSpec(mesh, Material(5000.0, 1060.0, 0.45, law), damping=Damping(0.0)))
+    law = Stiffening(onset_strain=0.095, cap_strain=0.277, tangent_cap=39.6)
+    mesh = box_mesh((0.04, 0.04, 0.04), (8, 8, 8))
+    model = compile_organ(OrganSpec(mesh, Material(2140.0, 1060.0, 0.45, law), damping=Damping(0.0)))
     state = blank_state(model)
     across = (1.0 + stretch) ** -0.45
     state.node_position[:] *= (across, across, 1.0 + stretch)

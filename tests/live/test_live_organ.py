@@ -52,9 +52,9 @@ class Follower:
 
 @pytest.mark.slow
 def test_fewer_substeps_feel_the_same():
-    """A press into a spleen in 3 substeps instead of 7, all the way in and half the way out."""
+    """A press into a spleen in 4 substeps instead of 5, all the way in and half the way out."""
     fewer = live.live_organ(SPLEEN, OrganChoice(lesions=NONE), Machine(load=0.1)).anatomy
-    assert fewer.scene.timing.substep_count < 0.5 * SPLEEN.timing.substep_count
+    assert fewer.scene.timing.substep_count < SPLEEN.timing.substep_count
     forces = []
     for anatomy in (load_anatomy(SPLEEN), fewer):
         organ = chosen_organ(anatomy, OrganChoice(lesions=NONE))
@@ -82,8 +82,8 @@ def test_a_slow_machine_gets_the_finest_cells_that_it_bears():
     organ = live.live_organ(SPLEEN, choice, machine)
     fine = load_anatomy(SPLEEN)
     assert organ.load == machine.load * machine.work[-1] / machine.work[0] <= live.LOAD_MOST
-    # Not coarser than a second try asks for: the load of the last but one try was too large.
-    assert machine.work[-2] / machine.work[0] * machine.load > live.LOAD_MOST
+    # Not coarser than a second try asks for: the load of the last but one mesh was too large. Softer tissue is the last.
+    assert machine.work[-3] / machine.work[0] * machine.load > live.LOAD_MOST
     assert organ.anatomy.mesh.node_count < fine.mesh.node_count == organ.node_count
     # The same body, of the same scene, whose hidden lesion is stable.
     volume = fine.mesh.volumes.sum()
@@ -108,16 +108,19 @@ def test_a_machine_too_slow_and_forces_too_wrong_are_said():
 @pytest.mark.slow
 def test_presses_on_coarser_cells_feel_alike():
     """Within the bound that is promised, and by less than on cells of the same size without the softer tissue."""
-    fine = load_anatomy(SPLEEN)
-    rng = np.random.default_rng(0)
-    sites = np.array([fine.face.random_point(rng, SPLEEN.palpation.face_margin)[0] for _ in range(5)])
-    forces, load = live.press_sites(fine, sites)
-    coarse = live.coarser_anatomy(fine, 1.3)
-    fewer, smaller = live.press_sites(coarse, sites)
-    stiffer, _ = live.press_sites(replace(coarse, scene=fine.scene), sites)
-    assert load > smaller > 0.0
-    assert np.median(abs(fewer / forces - 1.0)) < np.median(abs(stiffer / forces - 1.0))
-    np.testing.assert_allclose(fewer, forces, rtol=live.FORCE_ERROR_MOST)
+    pressed = []
+
+    def measure(anatomy, sites):
+        pressed.append((anatomy, sites))
+        return live.press_sites(anatomy, sites)[0], 1.2 if len(pressed) == 1 else 0.5
+
+    error = live.live_organ(SPLEEN, OrganChoice(lesions=NONE), measure).force_error
+    (fine, _), (stiff, _), (soft, checked) = pressed
+    assert soft.scene.material.youngs_modulus < stiff.scene.material.youngs_modulus == SPLEEN.material.youngs_modulus
+    stiffer = live.press_sites(stiff, checked)[0] / live.press_sites(fine, checked)[0] - 1.0
+    assert len(error) == len(checked) == live.SITES // 2
+    assert np.median(abs(error)) < np.median(abs(stiffer))
+    assert abs(error).max() < live.FORCE_ERROR_MOST
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ class LiveOrgan:
     Fields:
         anatomy: the scene's, with mass scaling, on its own mesh or on coarser cells
         load: processor time of a press over its simulated time; 0 if it was not measured
-        force_error: of presses on coarser cells, relative to the scene's mesh, at other places than those that chose the
+        force_error: of presses on coarser cells, relative to the scene's mesh, at other places than those for the
             modulus; empty on that mesh
         node_count: of the scene's mesh
     """

@@ -82,7 +82,7 @@ def test_a_slow_machine_gets_the_finest_cells_that_it_bears():
     organ = live.live_organ(SPLEEN, choice, machine)
     fine = load_anatomy(SPLEEN)
     assert organ.load == machine.load * machine.work[-1] / machine.work[0] <= live.LOAD_MOST
-    # Not coarser than a second try asks for: the load of the last but one mesh was too large. Softer tissue is the last.
+    # Not coarser than a second try asks for: the load of the last but one mesh was too large. Softer tissue came last.
     assert machine.work[-3] / machine.work[0] * machine.load > live.LOAD_MOST
     assert organ.anatomy.mesh.node_count < fine.mesh.node_count == organ.node_count
     # The same body, of the same scene, whose hidden lesion is stable.

@@ -345,8 +345,8 @@ def test_a_free_organ_gains_no_energy(stiffening: Stiffening | None, relaxation:
 def test_a_strained_block_keeps_its_energy_at_the_shipped_step(stretch: float):
     """At least 0.85 after 0.1 s at 0.6 of the limit; never above the start, to the swing of the scheme.
 
-    The law and modulus of `liver`. The drag that calms nodes under a held tip (`test_a_held_press_on_the_liver_is_calm`)
-    takes some of it, more in the same time from stiffer tissue, which swings faster.
+    Law and modulus are of `liver`. The drag that calms nodes under a held tip takes some of the energy
+    (`test_a_held_press_on_the_liver_is_calm`), more in the same time from stiffer tissue, which swings faster.
     """
     law = Stiffening(onset_strain=0.095, cap_strain=0.277, tangent_cap=39.6)
     mesh = box_mesh((0.04, 0.04, 0.04), (8, 8, 8))

@@ -2,6 +2,7 @@
 
     python -m agents.learn_retract --rounds 6 --out runs/retract_dagger.json
     python -m agents.learn_retract --pictures --rounds 22 --out runs/retract_pixels.json
+    python -m agents.learn_retract --pictures --rounds 8 --initial retract_pixels.json --out runs/other_tissue.json
 
 With `--pictures` the policy sees the endoscope's picture of 84 x 84 pixels and the force sensor (obs_mode="rgb_force")
 alone: neither the places of tip, lobe and target nor the jaw's opening. Its expert has the full state, but uses the
@@ -27,7 +28,13 @@ from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import lone_run
 from surgsim_apps.scoring.expert_retract import GRIP, HOLDS, PULL, SLICES, RetractExpert, TolerantExpert
 from surgsim_apps.training.fit import fit
-from surgsim_apps.training.policy_files import PolicyDescription, observation_declaration, policy_path, save_policy
+from surgsim_apps.training.policy_files import (
+    PolicyDescription,
+    load_policy,
+    observation_declaration,
+    policy_path,
+    save_policy,
+)
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork
 from surgsim_env.rendering import draw_look, find_look_ranges
 
@@ -171,6 +178,7 @@ def main() -> None:
     """Run DAgger; print a line and write the policy after each round."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=policy_path, required=True, help="the policy's file, NAME.json")
+    parser.add_argument("--initial", type=policy_path, help="a policy of the same observations to go on from")
     parser.add_argument("--pictures", action="store_true", help="from pictures and force, not from the state")
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--steps", type=int, default=170, help="control steps of each environment in a round")
@@ -189,13 +197,19 @@ def run(options: argparse.Namespace) -> None:
     settings = PICTURES if options.pictures else {}
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep", "dtype": "float32"}
     envs = gym.make_vec(ID, num_envs=options.envs, **lanes, **settings)
+    shares = EXPERT_SHARES
     if options.pictures:
         network = PolicyNetwork(NetworkLayout("relu", "PictureAndForce"), (920, 128, 64, 5))
     else:
         network = PolicyNetwork(NetworkLayout("tanh"), (56, 128, 128, 5), normalised=True)
+    if options.initial:
+        initial, shares = load_policy(options.initial).decider, EXPERT_SHARES[1:]
+        if not isinstance(initial, PolicyNetwork) or initial.layout != network.layout:
+            raise ValueError(f"--initial {options.initial}: not a policy of the observations to learn from")
+        network = initial
     player, samples, began = Player(envs, pictures=options.pictures, seed=options.seed), Samples(), time.time()
     for index in range(options.rounds):
-        won = player.play(network, samples, options.steps, (*EXPERT_SHARES, 0.0)[min(index, len(EXPERT_SHARES))])
+        won = player.play(network, samples, options.steps, (*shares, 0.0)[min(index, len(shares))])
         last = index == options.rounds - 1
         updates, rates = (2 * options.updates, (1e-3, 3e-5)) if last else (options.updates, (1e-3, 3e-4))
         loss = learn(network, samples, updates=updates, rates=rates, seed=options.seed + index)

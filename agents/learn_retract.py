@@ -160,11 +160,14 @@ class Player:
         return chosen, forces, np.array(actions, dtype=np.float32)
 
 
-def learn(network: PolicyNetwork, samples: Samples, *, updates: int, rates: tuple[float, float], seed: int) -> float:
-    """Fit a network to all samples; returns the mean loss."""
+def learn(
+    network: PolicyNetwork, samples: Samples, *, updates: int, rates: tuple[float, float], seed: int, normalises: bool
+) -> float:
+    """Fit a network to all samples, which set the mean and scale of a state's entries; returns the mean loss."""
     seen, labels = samples.joined()
     if not isinstance(seen, dict):
-        network.normalise_by(seen)
+        if normalises:
+            network.normalise_by(seen)
         return fit(network, seen, labels, updates=updates, rates=rates, seed=seed)
     taught = labels[:, network.action_size :]
     labels[:, network.action_size :] = (taught - taught.mean(axis=0)) / (taught.std(axis=0) + 1e-3)
@@ -212,7 +215,9 @@ def run(options: argparse.Namespace) -> None:
         won = player.play(network, samples, options.steps, (*shares, 0.0)[min(index, len(shares))])
         last = index == options.rounds - 1
         updates, rates = (2 * options.updates, (1e-3, 3e-5)) if last else (options.updates, (1e-3, 3e-4))
-        loss = learn(network, samples, updates=updates, rates=rates, seed=options.seed + index)
+        loss = learn(
+            network, samples, updates=updates, rates=rates, seed=options.seed + index, normalises=not options.initial
+        )
         count = sum(len(labels) for labels in samples.labels)
         success = float(np.mean(won)) if won else None
         line = {"round": index, "samples": count, "episodes": len(won), "success": success, "loss": loss}

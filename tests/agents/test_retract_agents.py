@@ -88,3 +88,26 @@ def test_dagger_leaves_a_policy_that_plays(tmp_path: Path, monkeypatch, capsys):
     policy.reset(1)
     (record,) = play_tasks(policy.act, envs(1, max_episode_steps=3), [5])
     assert record.steps == 3 and not record.last["success"]
+
+
+def test_dagger_goes_on_from_a_policy(tmp_path: Path, monkeypatch):
+    """After one update its first action is nearly that of the policy; another network or none is refused."""
+    from agents import learn_retract
+    from surgsim_apps.scoring.evaluate import policies_folder
+    from surgsim_apps.training.policy_files import load_policy
+
+    shipped, out = policies_folder() / "retract_dagger.json", tmp_path / "policy.json"
+
+    def learn(initial: Path) -> None:
+        arguments = ["--rounds", "1", "--envs", "1", "--steps", "1", "--updates", "1", "--out", str(out)]
+        monkeypatch.setattr(sys, "argv", ["learn_retract", *arguments, "--initial", str(initial)])
+        learn_retract.main()
+
+    learn(shipped)
+    seen = gym.make(ID).reset(seed=0)[0][None]
+    for policy in (before := load_policy(shipped), after := load_policy(out)):
+        policy.reset(1)
+    np.testing.assert_allclose(after.act(seen), before.act(seen), atol=0.3)
+    for other in ("retract_pixels.json", "sites_evolved.json"):
+        with pytest.raises(ValueError, match="not a policy of the observations to learn from"):
+            learn(policies_folder() / other)

@@ -9,8 +9,9 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import KDTree
 
+from msdm_core.errors import MeshError
 from msdm_core.material import Material
-from msdm_core.mesh import FloatArray, TetMesh, outward_facing
+from msdm_core.mesh import FloatArray, TetMesh, outward_facing, surface_carriers
 from msdm_core.meshing import RegionShare, mesh_surface, tag_tets
 from surgsim_apps.live.organ_choice import OrganChoice, chosen_organ
 from surgsim_env.coupling import Simulation
@@ -170,6 +171,8 @@ def live_organ(
 def coarser_anatomy(fine: Anatomy, growth: float) -> Anatomy:
     """The anatomy on a lattice in the boundary of its mesh, of cells `growth` times as large, twice that elsewhere.
 
+    Without the scene's fine surface, if that does not fit these cells.
+
     Raises:
         MeshError: a part or a region too thin for the cells.
     """
@@ -197,7 +200,15 @@ def coarser_anatomy(fine: Anatomy, growth: float) -> Anatomy:
             for tag, name in tags.items()
         ]
         coarse = TetMesh(coarse.points, coarse.tets, tag_tets(coarse, max(tags) + 1, shares), tags)
-    return anatomy_of(scene, coarse)
+    anatomy = anatomy_of(scene, coarse)
+    if anatomy.fine_surface is None:
+        return anatomy
+    try:
+        surface_carriers(anatomy.fine_surface[0], coarse)
+    except MeshError:
+        # A vertex beyond the reach of the larger cells: the boundary of the tets is drawn.
+        return anatomy_of(replace(scene, mesh=replace(scene.mesh, fine_surface=None)), coarse)
+    return anatomy
 
 
 def _softer(scene: Scene, stiffer: float) -> Scene:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import meshio
 import numpy as np
 import pytest
 from rich.console import Console
@@ -16,7 +17,7 @@ from surgsim_apps.live.organ_choice import HIDDEN, NONE, OrganChoice, chosen_org
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.scene.anatomy import anatomy_of, load_anatomy
 from surgsim_env.scene.load import make_scene
-from surgsim_env.scene.model import TissueRegion
+from surgsim_env.scene.model import FineSurface, TissueRegion
 from tests.live.protocol_client import press_path
 
 SPLEEN = make_scene("spleen_family")
@@ -121,6 +122,19 @@ def test_presses_on_coarser_cells_feel_alike():
     assert len(error) == len(checked) == live.SITES // 2
     assert np.median(abs(error)) < np.median(abs(stiffer))
     assert abs(error).max() < live.FORCE_ERROR_MOST
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("outward", "kept"), [(0.0, True), (0.02, False)])
+def test_a_fine_surface_is_drawn_where_the_larger_cells_carry_it(tmp_path, outward, kept):
+    """The boundary of the scene's tets, or the same 20 mm farther from their middle."""
+    plain = load_anatomy(SPLEEN)
+    away = plain.mesh.points - plain.mesh.points.mean(axis=0)
+    points = plain.mesh.points + outward * away / np.linalg.norm(away, axis=1, keepdims=True)
+    meshio.write_points_cells(tmp_path / "fine.ply", points, [("triangle", plain.mesh.boundary_triangles)])
+    source = replace(SPLEEN.mesh, fine_surface=FineSurface("fine.ply", "m"))
+    coarse = live.coarser_anatomy(anatomy_of(replace(SPLEEN, mesh=source, folder=tmp_path), plain.mesh), 1.3)
+    assert (coarse.fine_surface is not None) == kept
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Organs: compilation, supports and foundations, stable step, integration, measured quantities."""
 
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.fields import TissueFields, contact_points, tissue_fields
 from msdm_core.organ.measure import (
     contact_energy,
     element_means,
@@ -35,6 +36,7 @@ __all__ = [
     "OrganSpec",
     "Support",
     "SupportLaw",
+    "TissueFields",
     "advance",
     "advance_or_raise",
     "advance_organ",
@@ -42,6 +44,7 @@ __all__ = [
     "compile_organ",
     "contact_energy",
     "contact_node_area",
+    "contact_points",
     "describe_fault",
     "element_means",
     "element_size",
@@ -55,6 +58,7 @@ __all__ = [
     "scale_mass",
     "stable_dt",
     "support_forces",
+    "tissue_fields",
     "tissue_load",
     "unyielding",
 ]

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.arithmetic import dot, eigh, log, matmul, norm
+from msdm_core.arithmetic import dot, log, matmul, norm
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
     QUADRATURE_COUNT,
@@ -12,13 +12,11 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
-from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_volume_ratios
+from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_principal_values, fill_volume_ratios
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.support_kernels import add_support_forces, place_ground
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, area_vectors
 from msdm_core.organ.motion import SIGNAL
-
-ROUNDING = 1e-12  # margin of strains
 
 
 def kinetic_energy(model: OrganModel, state: OrganState) -> float:
@@ -37,17 +35,28 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     included.
     """
     elements = float(element_energies(model, element_strains(model, state.node_position)).sum())
-    ratio = volume_ratios(model, state)
-    squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_barrier_bulk > 0.0))
-    share = np.maximum(ratio[squeezed], 0.0) / SQUEEZED_RATIO
-    with np.errstate(divide="ignore"):
-        barrier = SQUEEZED_RATIO * SQUEEZED_RATIO * ((share - 1.0) - log(share))
-    volume = float(matmul((model.tet_barrier_bulk * model.tet_rest_volume)[squeezed], barrier))
+    volume = float(squeezed_energies(model, volume_ratios(model, state)).sum())
     lift = matmul(state.node_position - model.node_rest_position, model.gravity)
     ground = (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)
     moved = state.node_position[model.foundation_nodes] - (model.foundation_position + ground)
     held = 0.5 * float((dot(model.foundation_stiffness, moved[:, None]) * moved).sum())
     return elements + volume + held - float(matmul(model.node_mass, lift))
+
+
+def squeezed_energies(model: OrganModel, ratio: FloatArray) -> FloatArray:
+    """Energy of the barrier of each tet [J] (`potential_energy`), from the volume ratios J, both (n_tet,)."""
+    energy = np.zeros(len(ratio))
+    squeezed = np.flatnonzero(~(ratio >= SQUEEZED_RATIO) & (model.tet_barrier_bulk > 0.0))
+    share = np.maximum(ratio[squeezed], 0.0) / SQUEEZED_RATIO
+    with np.errstate(divide="ignore"):
+        barrier = SQUEEZED_RATIO * SQUEEZED_RATIO * ((share - 1.0) - log(share))
+    energy[squeezed] = (model.tet_barrier_bulk * model.tet_rest_volume)[squeezed] * barrier
+    return energy
+
+
+def squeezed_tensions(model: OrganModel, ratio: FloatArray) -> FloatArray:
+    """Tension of the barrier of each tet, K' (J - s) s / J below s (`element_kernels.tet_scale`) [Pa], (n_tet,)."""
+    return model.tet_barrier_bulk * np.minimum(ratio - SQUEEZED_RATIO, 0.0) * (SQUEEZED_RATIO / ratio)
 
 
 def element_strains(model: OrganModel, position: FloatArray) -> FloatArray:
@@ -59,13 +68,20 @@ def element_strains(model: OrganModel, position: FloatArray) -> FloatArray:
         model: the organ.
         position: of the nodes [m], (n_node, 3).
     """
-    ends = position[model.spring_nodes]
+    (along,) = spans(position, model.spring_nodes)
     ratio = np.empty(len(model.tet_nodes))
     fill_volume_ratios(position, model.tet_nodes, model.tet_rest_volume, ratio)
     quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
     averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(position)) / model.node_rest_volume
-    length = norm(ends[:, 1] - ends[:, 0], axis=1)
+    length = norm(along, axis=0)
     return np.concatenate([length / model.spring_rest_length, ratio, averaged]) - 1.0
+
+
+def spans(position: FloatArray, nodes: IntArray) -> list[FloatArray]:
+    """Vectors from the first node of each item to its others [m], (3, n) each; position (n_node, 3), nodes (n, m)."""
+    rows = np.ascontiguousarray(position.T)
+    first, *others = (rows.take(column, axis=1) for column in nodes.T)
+    return [other - first for other in others]
 
 
 def element_stiffness(model: OrganModel) -> FloatArray:
@@ -91,7 +107,15 @@ def node_shares(model: OrganModel, energy: FloatArray) -> FloatArray:
 
 def element_means(model: OrganModel, value: FloatArray) -> FloatArray:
     """Mean of a value of the nodes (n_node,) at each element, (n_element,)."""
-    return np.concatenate([value[model.spring_nodes].mean(axis=1), value[model.tet_nodes].mean(axis=1), value])
+    return np.concatenate([corner_means(value, model.spring_nodes), corner_means(value, model.tet_nodes), value])
+
+
+def corner_means(value: FloatArray, nodes: IntArray) -> FloatArray:
+    """Mean of a value of the nodes (n_node,) over the nodes (n, m) of each item, (n,)."""
+    total = value.take(nodes[:, 0])
+    for column in nodes.T[1:]:
+        total += value.take(column)
+    return total / nodes.shape[1]
 
 
 def element_tensions(model: OrganModel, strain: FloatArray) -> FloatArray:
@@ -207,24 +231,20 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
     add_gradients(model.node_rest_position, state.node_position, model.tet_nodes, gradient)
     gradient /= 4.0 * model.node_rest_volume[:, None, None]
     squared = matmul(gradient.transpose(0, 2, 1), gradient)
-    # Eigenvalues lie within the mean +- twice the root of a sixth of the deviator's square (Smith 1961): this bound
-    # leaves few nodes for the eigenvalues.
-    mean = np.trace(squared, axis1=1, axis2=2) / 3.0
-    spread = 2.0 * np.sqrt(np.maximum((squared * squared).sum(axis=(1, 2)) - 3.0 * (mean * mean), 0.0) / 6.0)
-    bound = np.maximum(np.sqrt(mean + spread) - 1.0, 1.0 - np.sqrt(np.maximum(mean - spread, 0.0)))
-    near = np.flatnonzero(bound >= _principal_strain(squared[[bound.argmax()]])[0] - ROUNDING)
-    strain = _principal_strain(squared[near])
+    strain = np.abs(np.sqrt(np.maximum(principal_values(squared), 0.0)) - 1.0).max(axis=1)
     equivalent = 0.0
     if model.stiffens:
         node_strain = node_strains(model, element_strains(model, state.node_position))
         equivalent = float(node_strain[model.node_excess > 0.0].max())
     place, most = int(pressure.argmax()), int(strain.argmax())
-    return TissueLoad(float(pressure[place]), place, float(strain[most]), int(near[most]), equivalent)
+    return TissueLoad(float(pressure[place]), place, float(strain[most]), most, equivalent)
 
 
-def _principal_strain(squared: FloatArray) -> FloatArray:
-    """Largest |lambda - 1| of the square roots lambda of the eigenvalues of C = F^T F (n, 3, 3), (n,)."""
-    return np.abs(np.sqrt(np.maximum(eigh(squared)[0], 0.0)) - 1.0).max(axis=1)
+def principal_values(matrices: FloatArray) -> FloatArray:
+    """Eigenvalues of symmetric matrices (n, 3, 3), descending, (n, 3); two close ones to 1e-8 of the deviator."""
+    values = np.empty((len(matrices), 3))
+    fill_principal_values(matrices, values)
+    return values
 
 
 def volume_ratios(model: OrganModel, state: OrganState) -> FloatArray:

@@ -15,6 +15,7 @@ from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE
 from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, KEPT_NAMES, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import relax_arms, rest_state
+from msdm_core.organ.fields import TissueFields, tissue_fields
 from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
 from msdm_core.organ.motion import SIGNAL, place_on_ground
 from msdm_core.organ.stability import stable_dt
@@ -165,6 +166,14 @@ class Simulation:
     def tissue_load(self) -> TissueLoad:
         """Largest contact pressure and strain of the organ at the end of the last haptic step."""
         return tissue_load(self.organ_model, self.organ_state, self.instrument.shapes, self.contact)
+
+    def fields(self) -> TissueFields:
+        """Contact traction, stress, stretch and energy of the organ as it is now, with the contact of the next substep.
+
+        Raises:
+            OrganDivergedError: a fault in that substep.
+        """
+        return tissue_fields(self.organ_model, self.organ_state, self.instrument.shapes, self.contact, self.substep_dt)
 
     @property
     def rest_position(self) -> FloatArray:

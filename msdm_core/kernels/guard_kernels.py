@@ -13,12 +13,14 @@ from msdm_core.kernels.space_kernels import (
     edge,
     length_of,
     minus,
+    opposite,
     row_of,
     scalar_product,
     shifted,
     times,
     vector_product,
 )
+from msdm_core.kernels.taxel_kernels import spread_force
 
 # Reach of the guard around a shape's axis, as a share of its radius; ordinary presses stay far from it.
 GUARD_SHARE = 0.6
@@ -81,7 +83,7 @@ def guard_axes(model, state, shapes, law, response, dt, candidate_count, referen
                 state.contact_passed[1] = triangle
                 kept = False
             elif place == NEAR:
-                _hold_off(model, state, shapes, response, dt, reference, wrench, shapes.shape_tool[shape], near)
+                _hold_off(model, state, shapes, response, dt, reference, wrench, shape, near)
     return kept
 
 
@@ -133,13 +135,14 @@ def near_axis(position, velocity, surface, shapes, law, dt, shape, triangle, wat
 
 
 @njit(**INLINED)
-def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near):
+def _hold_off(model, state, shapes, response, dt, reference, wrench, shape, near):
     """Guard's force on a point of a triangle, with its speed and mobility in this substep.
 
     Model: model, response
-    In:    shapes: twist and centre of the tool [m, rad, s], dt [s], reference [m] (n_tool, 3), tool, near
-    Out:   state: node_force [N] (n_node, 3), wrench, added to [N, N m] (n_tool, 6)
+    In:    shapes: twist and centre of the tool [m, rad, s], dt [s], reference [m] (n_tool, 3), shape, near
+    Out:   state: node_force [N] (n_node, 3), wrench, added to [N, N m] (n_tool, 6), shapes: taxel_force
     """
+    tool = shapes.shape_tool[shape]
     velocity, force, inverse_mass = state.node_velocity, state.node_force, model.node_inverse_mass
     mobility, out = response.tool_mobility, near.direction
     speed = -scalar_product(out, tool_velocity(shapes, tool, near.place))
@@ -162,6 +165,7 @@ def _hold_off(model, state, shapes, response, dt, reference, wrench, tool, near)
     for corner in range(3):
         add_to_row(force, near.corners[corner], times(near.weights[corner], push_out))
     react(wrench, reference, tool, near.place, push_out)
+    spread_force(shapes, shape, near.place, opposite(push_out))
 
 
 @njit(**INNER)

@@ -249,7 +249,8 @@ def shapes_of(lanes, shapes, lane):
         return shapes
     return ContactShapes(
         shapes.shape_ends[lane], shapes.shape_radius[lane], shapes.shape_tool[lane], shapes.tool_centre[lane],
-        shapes.tool_twist[lane], shapes.shape_span[lane], shapes.shape_friction[lane],
+        shapes.tool_twist[lane], shapes.shape_span[lane], shapes.shape_friction[lane], shapes.patch_layout[lane],
+        shapes.patch_frame[lane], shapes.taxel_force[lane],
     )  # fmt: skip
 
 

@@ -325,6 +325,10 @@ class ContactShapes(NamedTuple):
         tool_twist: linear [m/s] at the centre of mass, angular [rad/s]          (n_tool, 6)
         shape_span: from the axis to the rectangle's border, normal to it [m]    (n_shape, 3)
         shape_friction: Coulomb coefficient over the contact law's               (n_shape,)
+        patch_layout: of a patch of taxels: its shape, rows, columns, first taxel (n_patch, 4)
+        patch_frame: from the first end of the shape's axis to the patch's middle [m]; unit vectors along a row and
+            along a column, over the pitch [1/m]; turned by each haptic step     (n_patch, 3, 3)
+        taxel_force: mean force of the tissue on each taxel in the last call [N] (n_taxel, 3)
     """
 
     shape_ends: FloatArray
@@ -334,6 +338,9 @@ class ContactShapes(NamedTuple):
     tool_twist: FloatArray
     shape_span: FloatArray
     shape_friction: FloatArray
+    patch_layout: NDArray[np.int32]
+    patch_frame: FloatArray
+    taxel_force: FloatArray
 
 
 class ToolResponse(NamedTuple):

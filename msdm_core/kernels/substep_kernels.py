@@ -53,6 +53,7 @@ from msdm_core.kernels.support_kernels import (
     move_ground,
     place_ground,
 )
+from msdm_core.kernels.taxel_kernels import add_taxel_forces
 from msdm_core.kernels.tissue_kernels import (
     add_energies,
     add_spring_damping,
@@ -266,6 +267,7 @@ def _begin(lanes, model, state, shapes, response, duration):
         answer = response_of(lanes, response, lane)
         answer.tool_wrench[:, :] = 0.0
         answer.tool_lag[:, :] = 0.0
+        part_of(lanes, shapes.taxel_force, lane)[:, :] = 0.0
         state.candidate_count[lane] = find_candidates(
             surface_of(lanes, model, lane), touched_of(lanes, state, lane), shapes_of(lanes, shapes, lane), duration
         )
@@ -287,12 +289,18 @@ def _push_apart(lanes, model, state, shapes, law, response, dt, reference, wrenc
 
 @njit(**INLINED)
 def _hold(lanes, model, state, shapes, law, dt, decay, squeezed_count, reference, wrench, lane):
-    """Implicit contact and squeezed tets of a lane."""
-    surface, touched = surface_of(lanes, model, lane), touched_of(lanes, state, lane)
+    """Implicit contact, taxels and squeezed tets of a lane."""
+    surface, touched, moved = (
+        surface_of(lanes, model, lane),
+        touched_of(lanes, state, lane),
+        shapes_of(lanes, shapes, lane),
+    )
     hold_contact(
-        surface, touched, shapes_of(lanes, shapes, lane), law, dt, decay, state.contact_count[lane],
-        part_of(lanes, reference, lane), part_of(lanes, wrench, lane),
+        surface, touched, moved, law, dt, decay, state.contact_count[lane], part_of(lanes, reference, lane),
+        part_of(lanes, wrench, lane),
     )  # fmt: skip
+    if moved.patch_layout.shape[0] > 0:
+        add_taxel_forces(touched, moved, law, state.contact_count[lane])
     hold_squeezed(
         touched.node_position, touched.node_velocity, touched.node_force, surface.node_inverse_mass, model.tet_nodes,
         column_of(model.tet_inverse_volume, lane), column_of(model.tet_barrier_bulk, lane),
@@ -382,7 +390,7 @@ def _move_tools(lanes, state, shapes, response, dt, substep, wrench):
 
 @njit(**INLINED)
 def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
-    """Set mean wrenches and the lag of friction of moving lanes; restore the forces of stopped lanes."""
+    """Set mean wrenches, mean forces of taxels and the lag of friction of moving lanes; restore those stopped."""
     stands = False
     for lane in range(_lane_count(lanes)):
         if state.lane_fault[lane] != FAULT_NONE:
@@ -397,6 +405,10 @@ def _end(lanes, model, state, shapes, law, response, substep_count, wrench):
         for tool in range(push.shape[0]):
             for part in range(6):
                 push[tool, part] /= substep_count
+        taxels = part_of(lanes, shapes.taxel_force, lane)
+        for taxel in range(taxels.shape[0]):
+            for axis in range(3):
+                taxels[taxel, axis] /= substep_count
     if stands:
         _put_back_forces(lanes, state)
 

@@ -58,6 +58,9 @@ def round_shapes(
         tool_twist=np.zeros((len(centres), 6)) if twist is None else np.array(twist, dtype=np.float64).reshape(-1, 6),
         shape_span=np.zeros((count, 3)) if span is None else np.array(span, dtype=np.float64).reshape(count, 3),
         shape_friction=np.broadcast_to(np.asarray(friction, dtype=np.float64), (count,)).copy(),
+        patch_layout=np.zeros((0, 4), dtype=np.int32),
+        patch_frame=np.zeros((0, 3, 3)),
+        taxel_force=np.zeros((0, 3)),
     )
 
 

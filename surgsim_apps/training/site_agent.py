@@ -31,9 +31,12 @@ SLICES = channel_slices(
     contrast_noise=1,
     excess_least=1,
     lesion_radius=1,
+    gradient_map=2 * SITE_COUNT,
+    gradient_noise=1,
 )
 FACTS = ("map_cell", "chart_share", "contrast_noise", "excess_least", "lesion_radius")
-OBSERVATION_SIZE = max(part.stop for part in SLICES.values())
+# Without taxels.
+OBSERVATION_SIZE = SLICES["presses_left"].stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,7 @@ class SiteFacts:
         noise: standard deviation of one log contrast by the force sensor
         excess_least: the estimator's least excess of the log contrast of a lesion
         budget: presses of an episode
+        gradient_noise: standard deviation of one gradient of the log contrast by the taxels [1/m]; 0 without
     """
 
     map: TouchMap
@@ -55,6 +59,7 @@ class SiteFacts:
     noise: float
     excess_least: float
     budget: int = 25
+    gradient_noise: float = 0.0
 
     @property
     def extent(self) -> NDArray[np.float64]:
@@ -82,7 +87,8 @@ def observed_facts(observation: NDArray[np.floating]) -> SiteFacts:
     cell, share, noise, least, radius = (np.asarray(observation[SLICES[name]], dtype=np.float64) for name in FACTS)
     face = np.asarray(observation[SLICES["face_map"]]) > 0.5
     observed_map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)
-    return SiteFacts(observed_map, 1.0, float(radius[0]), float(noise[0]), float(least[0]))
+    blur = float(observation[SLICES["gradient_noise"]][0]) if len(observation) > OBSERVATION_SIZE else 0.0
+    return SiteFacts(observed_map, 1.0, float(radius[0]), float(noise[0]), float(least[0]), gradient_noise=blur)
 
 
 class SiteAgent(Protocol):
@@ -108,6 +114,7 @@ def site_facts(env: Any) -> SiteFacts:
         estimator.noise,
         estimator.excess_least,
         task.budget,
+        estimator.gradient_noise,
     )
 
 
@@ -128,7 +135,11 @@ class SiteProcess:
     def __init__(self, facts: SiteFacts) -> None:
         self.facts = facts
         self.process = contrast_process(
-            facts.map.axes, lesion_radius=facts.lesion_radius, noise=facts.noise, length_share=LENGTH_SHARE
+            facts.map.axes,
+            lesion_radius=facts.lesion_radius,
+            noise=facts.noise,
+            length_share=LENGTH_SHARE,
+            gradient_noise=facts.gradient_noise,
         )
         from_border = np.minimum(facts.sites, facts.extent - facts.sites) / facts.extent
         self.candidates = facts.map.pressable & (from_border.min(axis=1) >= BORDER)
@@ -139,8 +150,12 @@ class SiteProcess:
         It is about the excess alone: uncertainty of the background, the same at all sites, should attract no press.
         """
         pressed, values = remembered(observation)
-        places = self.facts.sites[pressed]
-        return Belief(self.process.mean(places, values)[1].ravel(), self.process.spread(places).ravel())
+        places, gradients = self.facts.sites[pressed], None
+        if self.facts.gradient_noise:
+            parts = np.asarray(observation[SLICES["gradient_map"]], dtype=np.float64).reshape(2, -1)
+            gradients = parts[:, pressed].T / self.facts.tip_radius
+        excess = self.process.mean(places, values, gradients)[1]
+        return Belief(excess.ravel(), self.process.spread(places).ravel())
 
     def best(
         self, worth: NDArray[np.float64], observation: NDArray[np.floating], rng: np.random.Generator

@@ -15,7 +15,7 @@ from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE
 from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, KEPT_NAMES, OrganModel, OrganState
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import relax_arms, rest_state
-from msdm_core.organ.fields import TissueFields, tissue_fields
+from msdm_core.organ.fields import ContactPoints, TissueFields, contact_points, tissue_fields
 from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
 from msdm_core.organ.motion import SIGNAL, place_on_ground
 from msdm_core.organ.stability import stable_dt
@@ -30,7 +30,6 @@ from surgsim_env.instruments.tool_bodies import check_tool_masses, place_support
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.model import substeps_needed
 
-# The fields of an organ's state that are saved.
 # What is drawn of an organ's motions, and saved.
 DRAWN_FIELDS = ("cycle_start", "cycle_size", "delay")
 # The tip may move this far beyond the organ's bounding box [m].
@@ -167,6 +166,15 @@ class Simulation:
         """Largest contact pressure and strain of the organ at the end of the last haptic step."""
         return tissue_load(self.organ_model, self.organ_state, self.instrument.shapes, self.contact)
 
+    def contact_points(self) -> ContactPoints:
+        """Points of the organ's surface in contact, with their forces in the next substep.
+
+        Raises:
+            OrganDivergedError: a fault in that substep.
+        """
+        shapes = self.instrument.shapes
+        return contact_points(self.organ_model, self.organ_state, shapes, self.contact, self.substep_dt)
+
     def fields(self) -> TissueFields:
         """Contact traction, stress, stretch and energy of the organ as it is now, with the contact of the next substep.
 
@@ -174,6 +182,15 @@ class Simulation:
             OrganDivergedError: a fault in that substep.
         """
         return tissue_fields(self.organ_model, self.organ_state, self.instrument.shapes, self.contact, self.substep_dt)
+
+    @property
+    def taxels(self) -> FloatArray | None:
+        """Force of the tissue on each taxel in the last haptic step [N], `TaxelPatches.forces`; None without taxels.
+
+        Their sum is that of `contact_wrench` on the contact shapes with a patch.
+        """
+        patches = self.instrument.patches
+        return None if patches is None else patches.forces
 
     @property
     def rest_position(self) -> FloatArray:
@@ -244,6 +261,7 @@ class Simulation:
         state.volume_ratio_smallest[:] = 1.0
         self.instrument.place(tip_position)
         self._wrench[:] = 0.0
+        self.instrument.shapes.taxel_force[:] = 0.0
         self.fault = ""
         self.force_peak = self.pull_peak = 0.0
 
@@ -414,6 +432,7 @@ class Simulation:
             "rest_position": self._rest_position.copy(),
             "rest_stretch": self._rest_stretch.copy(),
             "wrench": self._wrench.copy(),
+            "taxel_force": self.instrument.shapes.taxel_force.copy(),
             "pull_peak": np.array(self.pull_peak),
             "step": np.array(self._step),
             "fault": np.array(self.fault),
@@ -447,6 +466,7 @@ class Simulation:
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()
         self._wrench[:] = arrays["wrench"]
+        self.instrument.shapes.taxel_force[:] = arrays["taxel_force"]
         self.pull_peak = float(arrays["pull_peak"])
         self._step = int(arrays["step"])
         self.fault = str(arrays["fault"])

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from msdm_core.arithmetic import dot, matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
+from surgsim_env.instruments.patches import TaxelPatches
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, ToolBodies
+from surgsim_env.scene.model import SceneInstrument
 
 # Without a handler MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working folder.
 if mujoco.get_mju_user_warning() is None:
@@ -17,8 +19,6 @@ if mujoco.get_mju_user_warning() is None:
 
 # Time from open to closed [s].
 STROKE_TIME = 0.5
-# The pads of a jaw at rest face each other along UP as closely as possible; along UP_ELSE if the jaw points along UP.
-UP, UP_ELSE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
 
 
 class Jaw:
@@ -131,15 +131,6 @@ class Jaw:
         return axes * np.sign(matmul(outward, gap) * np.array([1.0, -1.0]))[:, None]
 
 
-def frame_along(direction: FloatArray) -> FloatArray:
-    """Right-handed frame with -z along a direction and y as close to up as possible, as columns (3, 3)."""
-    z = -direction / norm(direction)
-    up = UP if abs(matmul(z, UP)) < 0.9 else UP_ELSE
-    y = up - matmul(up, z) * z
-    y /= norm(y)
-    return np.stack([np.cross(y, z), y, z], axis=1)
-
-
 @dataclass(frozen=True)
 class Grasp:
     """Hold of a jaw on tissue, from the contact forces of one haptic step.
@@ -192,9 +183,11 @@ class Instrument(ToolBodies):
         parked: position of the tip before the first reset [m]                   (3,)
         jaw: None without one
         turning_size: size of the angular velocity command: 0 if the tip does not turn, 1 about a hinge, 3 in space
+        patches: of taxels; None without
     """
 
     turning_size = 0
+    patches: TaxelPatches | None = None
     lower: FloatArray
     upper: FloatArray
     parked: FloatArray
@@ -297,6 +290,23 @@ class Instrument(ToolBodies):
         mujoco.mj_resetData(self.model, self.data)
         self.servo.command[:] = 0.0
         self.servo.limited[:] = False
+
+    def set_patches(self, description: SceneInstrument, outward: FloatArray) -> None:
+        """Put the scene's taxels on the jaw's pads, else on the contact shape nearest to the tip, which faces outward.
+
+        Args:
+            description: of the instrument in the scene.
+            outward: direction of the tip in its present pose, (3,).
+        """
+        if description.taxels is None:
+            return
+        mujoco.mj_kinematics(self.model, self.data)
+        if self.jaw is None:
+            away = norm(self.data.geom_xpos[self.geoms] - self.tip_position, axis=1)
+            shapes, normals = np.array([np.argmin(away)]), outward[None]
+        else:
+            shapes, normals = self.jaw.shapes, self.jaw.normals
+        self.patches = TaxelPatches(self, description.taxels, description.tip_radius, shapes, normals)
 
     def _set_jaw(self, jaw: Jaw) -> None:
         self.jaw, self.jaws = jaw, jaw.tools[None]

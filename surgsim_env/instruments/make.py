@@ -8,8 +8,8 @@ import numpy as np
 
 from msdm_core.arithmetic import arctan2, cos, matmul, norm, sin
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
-from surgsim_env.instruments.tool_bodies import add_supports, make_servo
+from surgsim_env.instruments.instrument import Instrument, Jaw
+from surgsim_env.instruments.tool_bodies import add_supports, frame_along, make_servo
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import pair_names, scenes_folder
 from surgsim_env.scene.model import CARTESIAN, Scene
@@ -202,4 +202,6 @@ def make_instrument(anatomy: Anatomy, lower: FloatArray, upper: FloatArray) -> I
 
         return ArmInstrument(anatomy, lower, upper)
     kind = Grasper if read_model(scene.instrument.model).body("jaw") is not None else Probe
-    return kind(scene, lower, upper)
+    instrument = kind(scene, lower, upper)
+    instrument.set_patches(scene.instrument, np.asarray(scene.instrument.approach))
+    return instrument

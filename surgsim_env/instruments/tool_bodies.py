@@ -31,6 +31,8 @@ SUPPORT_BIT = 2
 # the tool.
 SOLREF = (-7500.0, -173.0)
 SOLIMP = (0.5, 0.5, 0.001, 0.5, 2.0)
+# The pads of a jaw at rest face each other along UP as closely as possible; along UP_ELSE if the jaw points along UP.
+UP, UP_ELSE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
 SUPPORT_COLOUR = (0.125, 0.335, 0.375, 1.0)
 _GEOMS = {
     "plane": mujoco.mjtGeom.mjGEOM_PLANE,
@@ -38,6 +40,15 @@ _GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
+
+
+def frame_along(direction: FloatArray) -> FloatArray:
+    """Right-handed frame with -z along a direction and y as close to up as possible, as columns (3, 3)."""
+    z = -direction / norm(direction)
+    up = UP if abs(matmul(z, UP)) < 0.9 else UP_ELSE
+    y = up - matmul(up, z) * z
+    y /= norm(y)
+    return np.stack([np.cross(y, z), y, z], axis=1)
 
 
 def make_servo(lower: FloatArray, upper: FloatArray, position: IndexArray, speed: IndexArray) -> Servo:
@@ -86,19 +97,22 @@ def _coupling_inertia(model: mujoco.MjModel) -> FloatArray:
 class ToolBodies:
     """Tools of a MuJoCo model: the bodies with contact shapes.
 
-    A subclass sets the `servo` of its joints; here it has none. Wrenches and twists refer to a body's centre of
-    mass, as `xfrc_applied` and `mj_objectVelocity` do. MuJoCo gives angular before linear velocities;
+    A subclass sets the `servo` of its joints, and `patch_local`; here it has none. Wrenches and twists refer to a
+    body's centre of mass, as `xfrc_applied` and `mj_objectVelocity` do. MuJoCo gives angular before linear velocities;
     `tool_kernels.read_shapes` swaps them, and nothing else does.
+
+    Fields:
+        geoms: geom of each contact shape                                        (n_shape,)
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """Find the tools of a model, without changing it."""
         self.model = model
         self.data = mujoco.MjData(model)
-        self._geoms = np.flatnonzero(model.geom_group == CONTACT_GROUP)
-        bodies = model.geom_bodyid[self._geoms]
+        self.geoms = np.flatnonzero(model.geom_group == CONTACT_GROUP)
+        bodies = model.geom_bodyid[self.geoms]
         self._tools = np.unique(bodies)
-        size, kind = model.geom_size[self._geoms], model.geom_type[self._geoms]
+        size, kind = model.geom_size[self.geoms], model.geom_type[self.geoms]
         box, capsule = kind == mujoco.mjtGeom.mjGEOM_BOX, kind == mujoco.mjtGeom.mjGEOM_CAPSULE
         # The core of a box, rounded by its smallest half size, lies along its longest axis and spans the other
         # (thin, middle, long); other geoms lie along z, and their first size is the radius.
@@ -109,15 +123,16 @@ class ToolBodies:
         self._half_width = np.where(box, middle - thin, 0.0)
         count = len(self._tools)
         self.shapes = round_shapes(
-            np.zeros((len(self._geoms), 2, 3)),
+            np.zeros((len(self.geoms), 2, 3)),
             thin.copy(),
-            friction=np.array([_roughness(model, int(geom)) for geom in self._geoms]),
+            friction=np.array([_roughness(model, int(geom)) for geom in self.geoms]),
             tool=np.searchsorted(self._tools, bodies),
             centre=np.zeros((count, 3)),
         )
         self.response = unyielding(count)
         self.servo = make_servo(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
         self.jaws = np.zeros((0, 2), dtype=np.int32)
+        self.patch_local = np.zeros((0, 3, 3))
         self._velocity = np.zeros(6)
         self._jacobians = np.zeros((count, 6, model.nv))
         self._inertia = np.zeros((model.nv, model.nv))
@@ -171,7 +186,7 @@ class ToolBodies:
             model=model._address if compiled else model,
             data=data._address if compiled else data,
             timestep=model.opt.timestep,
-            geoms=self._geoms,
+            geoms=self.geoms,
             axis=self._axis,
             half_length=self._half_length,
             across=self._across,
@@ -187,6 +202,7 @@ class ToolBodies:
             control=data.ctrl,
             servo=self.servo,
             jaws=self.jaws,
+            patch_local=self.patch_local,
             velocity=self._velocity,
             jacobians=self._jacobians,
             inertia=self._inertia,

@@ -64,6 +64,8 @@ class ToolViews(NamedTuple):
         control: of all actuators                                                (nu,)
         servo: of the controls
         jaws: the two fingers of each jaw, as tools                              (n_jaw, 2)
+        patch_local: patches of taxels: middle [m], unit vectors along a row and along a column over the pitch [1/m],
+            in the frame of their geom                                           (n_patch, 3, 3)
         velocity, jacobians, inertia, yielded: scratch             (6,), (n_tool, 6, nv), (nv, nv), (nv, 6)
     """
 
@@ -86,6 +88,7 @@ class ToolViews(NamedTuple):
     control: FloatArray
     servo: Servo
     jaws: NDArray[np.int32]
+    patch_local: FloatArray
     velocity: FloatArray
     jacobians: FloatArray
     inertia: FloatArray
@@ -169,7 +172,8 @@ def drive_servo(tools):
 def read_shapes(tools, shapes):
     """Read pose and twist of each contact shape in the current step; call after mj_step1.
 
-    Out: shapes.shape_ends, shape_span, tool_centre [m], tool_twist [m/s, rad/s]; MuJoCo gives angular before linear
+    Out: shapes.shape_ends, shape_span, patch_frame, tool_centre [m], tool_twist [m/s, rad/s]; MuJoCo gives angular
+         before linear
     """
     for shape in range(tools.geoms.shape[0]):
         geom = tools.geoms[shape]
@@ -179,6 +183,17 @@ def read_shapes(tools, shapes):
             shapes.shape_ends[shape, 0, axis] = tools.geom_position[geom, axis] - offset
             shapes.shape_ends[shape, 1, axis] = tools.geom_position[geom, axis] + offset
             shapes.shape_span[shape, axis] = tools.geom_rotation[geom, 3 * axis + across] * tools.half_width[shape]
+    for patch in range(tools.patch_local.shape[0]):
+        shape = shapes.patch_layout[patch, 0]
+        geom = tools.geoms[shape]
+        for row in range(3):
+            for axis in range(3):
+                value = 0.0
+                for part in range(3):
+                    value += tools.geom_rotation[geom, 3 * axis + part] * tools.patch_local[patch, row, part]
+                shapes.patch_frame[patch, row, axis] = value
+        for axis in range(3):
+            shapes.patch_frame[patch, 0, axis] += tools.geom_position[geom, axis] - shapes.shape_ends[shape, 0, axis]
     for tool in range(tools.bodies.shape[0]):
         body = tools.bodies[tool]
         mj_objectVelocity(tools.model, tools.data, OBJECT_BODY, body, tools.velocity, 0)

@@ -38,6 +38,8 @@ ROUNDING = 1e-9
 LANES = {np.float64: 8, np.float32: 16}
 # Largest added share of mass of the organ of a patient's map.
 MASS_SHARE = 0.025
+# Version of a map's contents.
+MAP_VERSION = 2
 # Environment variable with the cache's folder.
 FOLDER_VARIABLE = "SURGSIM_CACHE"
 
@@ -65,9 +67,12 @@ class Chart:
 
     def place(self, point: ArrayLike) -> FloatArray:
         """Place (..., 2) of a point (..., 3) [m] on the chart: -1 to 1 along each axis inside it."""
-        values = np.asarray(point, dtype=np.float64)
-        plane = np.stack([matmul(values, self.across), matmul(values, self.along)], axis=-1)
-        return 2.0 * (plane - self.lower) / self.extent - 1.0
+        return 2.0 * (self.along_axes(point) - self.lower) / self.extent - 1.0
+
+    def along_axes(self, vector: ArrayLike) -> FloatArray:
+        """Parts (..., 2) of a vector (..., 3) along the chart's axes."""
+        values = np.asarray(vector, dtype=np.float64)
+        return np.stack([matmul(values, self.across), matmul(values, self.along)], axis=-1)
 
     def plane_point(self, place: ArrayLike) -> FloatArray:
         """Point of the plane [m] (..., 2) at a place (..., 2) of the chart, the inverse of `place`."""
@@ -286,13 +291,21 @@ def interpolated(values: FloatArray, places: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class HealthyMap:
-    """Stiffness of presses on healthy tissue of nominal modulus [N/m], on a square grid over the chart (m, m)."""
+    """Presses on healthy tissue of nominal modulus, on a square grid over the chart.
+
+    Fields:
+        grid: stiffness [N/m], and centre of pressure from the tip's pole along the chart's axes [m]     (m, m, 3)
+    """
 
     grid: FloatArray
 
     def stiffness(self, places: ArrayLike) -> FloatArray:
         """At places of the chart (..., 2) [N/m], shape (...)."""
-        return interpolated(self.grid, places)
+        return interpolated(self.grid[:, :, 0], places)
+
+    def centre(self, places: ArrayLike) -> FloatArray:
+        """Centre of pressure from the tip's pole at places of the chart (..., 2), along its axes [m], (..., 2)."""
+        return interpolated(self.grid[:, :, 1:], places)
 
 
 @lru_cache(maxsize=CACHED_MOST + 8)
@@ -372,7 +385,7 @@ def _shipped(path: Path, digest: str) -> FloatArray | None:
 
 
 def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64) -> FloatArray:
-    """Press the healthy organ at each site of the chart's grid; stiffness [N/m], shape (m, m).
+    """Press the healthy organ at each site of the chart's grid; `HealthyMap.grid`, shape (m, m, 3).
 
     A coarser grid would alias the mesh, with 3 % changes of force within a cell, into a slope of the organ.
     """
@@ -380,38 +393,39 @@ def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64)
     grid = charted.grid_sites()
     # Unpressable places are moved to others of the grid.
     sites = {site.place.tobytes(): site for site in grid}
-    stiffness = press_sites(anatomy, list(sites.values()), progress, dtype)
-    values = dict(zip(sites, stiffness.tolist(), strict=True))
-    return np.array([values[site.place.tobytes()] for site in grid]).reshape(charted.chart.side_count, -1)
+    presses = press_sites(anatomy, list(sites.values()), progress, dtype)
+    values = dict(zip(sites, presses, strict=True))
+    side = charted.chart.side_count
+    return np.array([values[site.place.tobytes()] for site in grid]).reshape(side, side, 3)
 
 
 def press_sites(
     anatomy: Anatomy, sites: Sequence[Site], progress: StepProgress, dtype: type = np.float64, name: str = ""
 ) -> FloatArray:
-    """Stiffness of presses on the healthy organ of an anatomy at sites [N/m], (n_site,), in lanes.
+    """Presses on the healthy organ of an anatomy at sites, in lanes: rows of `HealthyMap.grid`, (n_site, 3).
 
     The progress shows `name`.
 
     Raises:
         ValueError: a press that ended in a fault or measured no force (states its place).
     """
-    phases, lanes = press_phases(anatomy.scene), LANES[dtype]
+    phases, lanes, chart = press_phases(anatomy.scene), LANES[dtype], charted_face(anatomy).chart
     batches = [sites[first : first + lanes] for first in range(0, len(sites), lanes)]
 
     def group() -> LaneGroup:
         return LaneGroup([Simulation(anatomy) for _ in range(lanes)], dtype)
 
-    def press(own: LaneGroup, number: int) -> list[float]:
+    def press(own: LaneGroup, number: int) -> list[FloatArray]:
         batch = batches[number]
         pairs = zip(own.simulations, batch, strict=False)
         presses = [SitePress(simulation, site.point, site.normal) for simulation, site in pairs]
         press_in_lanes(own, presses, phases)
         advance(len(batch))
-        return [_stiffness(anatomy, press) for press in presses]
+        return [np.append(_stiffness(anatomy, press), chart.along_axes(press.centre)) for press in presses]
 
     with progress.step(f"pressing the healthy organ {name}".strip(), len(sites)) as advance:
-        stiffness = in_threads(group, press, len(batches))
-    return np.array([value for batch in stiffness for value in batch])
+        rows = in_threads(group, press, len(batches))
+    return np.array([row for batch in rows for row in batch])
 
 
 def _stiffness(anatomy: Anatomy, press: SitePress) -> float:
@@ -436,7 +450,8 @@ def map_digest(anatomy: Anatomy) -> str:
         tuple(anchor for anchor in scene.anchors if anchor.is_elastic),
     )
     instrument = (scenes_folder() / "instruments" / scene.instrument.model).read_bytes()
-    return content_digest(anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors, parts, instrument, PHYSICS_VERSION)
+    version = (PHYSICS_VERSION, MAP_VERSION)
+    return content_digest(anatomy.mesh.points, anatomy.mesh.tets, anatomy.anchors, parts, instrument, version)
 
 
 def cache_folder() -> Path:

@@ -21,6 +21,8 @@ EXCESS_SPREAD = 0.225
 EXCESS_LENGTH = 0.010
 # Deviation of healthy presses beside the sensor's noise: a capsule absent from the map, the mesh.
 MODEL_SPREAD = 0.05
+# Deviation of the gradient by taxels beside their noise [1/m]: bells that are not the process', the mesh.
+GRADIENT_SPREAD = 8.0
 # Deviation of healthy presses about the map of a curved organ: capsules and moduli absent from the map show where the
 # tissue is thinner, and a member's map has errors. On the training split of `liver_family` 0.009 to 0.032; more
 # costs nothing there, less adds false lesions (docs/palpation.md). On blocks, with flat faces, 0.007 to 0.016,
@@ -45,65 +47,102 @@ class ContrastProcess:
     """Gaussian process regression with fixed hyperparameters (Rasmussen & Williams 2006, eq. 2.25 and 2.26).
 
     log contrast at x = b + e(x) + noise, b ~ N(0, sb^2), e ~ GP(0, se^2 exp(-|x - x'|^2 / (2 l^2))): b is common to all
-    sites (modulus, capsule, the sensor's bias), e the excess over it.
+    sites (modulus, capsule, the sensor's bias), e the excess over it. With taxels a press also measures
+    grad e + noise, whose covariances are the derivatives of e's (section 9.4).
 
     Args:
         axes: coordinates of a grid's columns and rows along the chart's sides [m], shapes (g0,) and (g1,)
         length: correlation length l of the excess [m]
         noise_variance: of one press
+        gradient_variance: of the gradient's noise along each side [1/m^2]; 0 without taxels
     """
 
     axes: tuple[FloatArray, FloatArray]
     length: float
     noise_variance: float
+    gradient_variance: float = 0.0
 
-    def mean(self, places: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
+    def mean(
+        self, places: FloatArray, values: FloatArray, gradients: FloatArray | None = None
+    ) -> tuple[float, FloatArray]:
         """Posterior means of the background, and of the excess at the grid's points (g1, g0).
 
         Args:
             places: of the presses [m], shape (n, 2).
             values: their log contrast, shape (n,).
+            gradients: of the log contrast along the chart's sides [1/m], shape (n, 2); read with taxels.
         """
-        along, across = self._to_grid(places)
         if len(values) == 0:
-            return 0.0, np.zeros((len(along), len(across)))
-        weights = solve(self._covariance(places), values)
-        # The covariance is a product over the axes: the map is one matrix product.
-        excess = matmul(EXCESS_SPREAD * EXCESS_SPREAD * (along * weights), across.T)
-        return BACKGROUND_SPREAD * BACKGROUND_SPREAD * float(weights.sum()), excess
+            return 0.0, np.zeros((len(self.axes[1]), len(self.axes[0])))
+        measured = values
+        if self.gradient_variance:
+            assert gradients is not None
+            measured = np.concatenate([values, gradients.T.ravel()])
+        weights = solve(self._covariance(places), measured).reshape(-1, len(places))
+        # The covariance is a product over the axes: the map is a matrix product for each derivative.
+        grid = self._to_grid(places)
+        parts = [matmul(along * part, across.T) for (along, across), part in zip(grid, weights, strict=True)]
+        background = BACKGROUND_SPREAD * BACKGROUND_SPREAD * float(weights[0].sum())
+        return background, EXCESS_SPREAD * EXCESS_SPREAD * np.sum(parts, axis=0)
 
     def spread(self, places: FloatArray) -> FloatArray:
         """Posterior standard deviation of the excess at the grid's points (g1, g0), given presses at places (n, 2)."""
-        along, across = self._to_grid(places)
+        shape = (len(self.axes[1]), len(self.axes[0]))
         if len(places) == 0:
-            return np.full((len(along), len(across)), EXCESS_SPREAD)
-        between = EXCESS_SPREAD * EXCESS_SPREAD * along[:, None] * across
-        explained = solve(self._covariance(places), between.reshape(-1, len(places)).T).T
-        variance = EXCESS_SPREAD * EXCESS_SPREAD - (explained.reshape(between.shape) * between).sum(axis=2)
-        return np.sqrt(np.maximum(variance, 0.0))
+            return np.full(shape, EXCESS_SPREAD)
+        parts = [along[:, None] * across for along, across in self._to_grid(places)]
+        between = EXCESS_SPREAD * EXCESS_SPREAD * np.concatenate(parts, axis=2).reshape(-1, len(places) * len(parts))
+        explained = solve(self._covariance(places), between.T).T
+        variance = EXCESS_SPREAD * EXCESS_SPREAD - (explained * between).sum(axis=1)
+        return np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
 
-    def _to_grid(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Factors of the correlation between rows and presses (g1, n), and between columns and presses (g0, n)."""
-        across, along = (self._correlation(axis, places[:, i]) for i, axis in enumerate(self.axes))
-        return along, across
+    @property
+    def _derivatives(self) -> tuple[tuple[int, int], ...]:
+        """Orders of the measured derivatives along the chart's first and second axis."""
+        return ((0, 0), (1, 0), (0, 1)) if self.gradient_variance else ((0, 0),)
+
+    def _to_grid(self, places: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """Factors of the correlation of each measured derivative with rows (g1, n) and with columns (g0, n)."""
+        columns, rows = (self._factors(axis, places[:, i]) for i, axis in enumerate(self.axes))
+        return [(rows[0, second], columns[0, first]) for first, second in self._derivatives]
 
     def excess_covariance(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Covariance of the excess at places [m] (n, 2) and (m, 2), shape (n, m)."""
-        columns, rows = (self._correlation(first[:, i], second[:, i]) for i in range(2))
-        return EXCESS_SPREAD * EXCESS_SPREAD * (columns * rows)
+        """Covariance of the excess, and of its gradient if measured, at places [m] (n, 2) and (m, 2).
+
+        Shape (n, m), or (3 n, 3 m): of the excess and its derivatives along the first and the second axis.
+        """
+        columns, rows = (self._factors(first[:, i], second[:, i]) for i in range(2))
+        orders = self._derivatives
+        blocks = [[columns[i, k] * rows[j, m] for k, m in orders] for i, j in orders]
+        return EXCESS_SPREAD * EXCESS_SPREAD * np.block(blocks)
 
     def _covariance(self, places: FloatArray) -> FloatArray:
-        """Covariance of the presses' log contrasts, (n, n)."""
-        covariance = self.excess_covariance(places, places) + BACKGROUND_SPREAD * BACKGROUND_SPREAD
-        covariance.flat[:: len(places) + 1] += self.noise_variance
+        """Covariance of the measured log contrasts and gradients, (n, n) or (3 n, 3 n)."""
+        count, covariance = len(places), self.excess_covariance(places, places)
+        covariance[:count, :count] += BACKGROUND_SPREAD * BACKGROUND_SPREAD
+        diagonal = covariance.ravel()[:: len(covariance) + 1]
+        diagonal[:count] += self.noise_variance
+        diagonal[count:] += self.gradient_variance
         return covariance
 
-    def _correlation(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        return exp(-0.5 * np.square((first[:, None] - second) / self.length))
+    def _factors(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Correlation along one axis between coordinates (n,) and (m,), and its derivatives, (2, 2, n, m).
+
+        The first index is the order of the derivative by the first coordinate, the second that by the second.
+        """
+        step = (first[:, None] - second) / self.length
+        value = exp(-0.5 * np.square(step))
+        slope = value * step / self.length
+        return np.array([[value, slope], [-slope, value * (1.0 - step * step) / (self.length * self.length)]])
 
 
 def contrast_process(
-    axes: tuple[FloatArray, FloatArray], *, lesion_radius: float, noise: float, length_share: float = 1.0
+    axes: tuple[FloatArray, FloatArray],
+    *,
+    lesion_radius: float,
+    noise: float,
+    length_share: float = 1.0,
+    gradient_noise: float = 0.0,
 ) -> ContrastProcess:
     """Process for lesions of a radius [m] and a sensor's standard deviation of one log contrast.
 
@@ -112,9 +151,16 @@ def contrast_process(
         lesion_radius: mean radius of the lesions [m].
         noise: standard deviation of one log contrast by the force sensor.
         length_share: factor on the correlation length.
+        gradient_noise: standard deviation of the gradient of one press by the taxels [1/m]; 0 without taxels.
     """
-    length = length_share * (EXCESS_LENGTH * (lesion_radius / REFERENCE_LESION_RADIUS))
-    return ContrastProcess(axes, length, noise * noise + MODEL_SPREAD * MODEL_SPREAD)
+    scale = lesion_radius / REFERENCE_LESION_RADIUS
+    spread = GRADIENT_SPREAD / scale if gradient_noise else 0.0
+    return ContrastProcess(
+        axes,
+        length_share * (EXCESS_LENGTH * scale),
+        noise * noise + MODEL_SPREAD * MODEL_SPREAD,
+        gradient_noise * gradient_noise + spread * spread,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,29 +192,43 @@ class LesionEstimator:
         lesion_radius: mean radius of the lesions [m]; the model's lengths scale with it.
         noise: standard deviation of one log contrast by the sensor: its noise over the force of a healthy press.
         map_spread: standard deviation of the log contrast of healthy presses about the map, 0 on a block.
+        gradient_noise: standard deviation of the gradient of one press by the taxels [1/m]; 0 without taxels.
     """
 
-    def __init__(self, extent: ArrayLike, *, lesion_radius: float, noise: float, map_spread: float = 0.0) -> None:
+    def __init__(
+        self,
+        extent: ArrayLike,
+        *,
+        lesion_radius: float,
+        noise: float,
+        map_spread: float = 0.0,
+        gradient_noise: float = 0.0,
+    ) -> None:
         self.extent = np.asarray(extent, dtype=np.float64)
-        self.lesion_radius, self.noise = lesion_radius, noise
+        self.lesion_radius, self.noise, self.gradient_noise = lesion_radius, noise, gradient_noise
         self.scale = lesion_radius / REFERENCE_LESION_RADIUS
         self.excess_least = EXCESS_LEAST + EXCESS_LEAST_NOISE * noise + EXCESS_LEAST_MAP * map_spread
         # Coordinates of the map's points along each axis [m], from edge to edge.
         spacing = MAP_SPACING * self.scale
         first, second = (np.linspace(0.0, side, max(2, round(side / spacing) + 1)) for side in self.extent)
         self.axes = (first, second)
-        self.process = contrast_process(self.axes, lesion_radius=lesion_radius, noise=noise)
+        self.process = contrast_process(
+            self.axes, lesion_radius=lesion_radius, noise=noise, gradient_noise=gradient_noise
+        )
 
-    def estimate(self, places: ArrayLike, log_contrast: ArrayLike) -> LesionEstimate:
+    def estimate(
+        self, places: ArrayLike, log_contrast: ArrayLike, gradients: FloatArray | None = None
+    ) -> LesionEstimate:
         """Estimate lesions from presses; none without a press.
 
         Args:
             places: of the presses on the chart [m], shape (n, 2).
             log_contrast: log of stiffness over healthy stiffness, shape (n,).
+            gradients: of the log contrast along the chart's sides [1/m], shape (n, 2); read with taxels.
         """
         places = np.asarray(places, dtype=np.float64).reshape(-1, 2)
         values = np.asarray(log_contrast, dtype=np.float64)
-        background, excess = self.process.mean(places, values)
+        background, excess = self.process.mean(places, values, gradients)
         points, strength = self._maxima(excess)
         return LesionEstimate(points, strength, background, excess, self._outline(excess, points, strength), self.axes)
 

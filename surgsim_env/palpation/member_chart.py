@@ -71,23 +71,26 @@ def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
 
 
 def _corrected(base: HealthyMap, member: Anatomy, template: Anatomy, progress: StepProgress) -> FloatArray:
-    """Map of the template times the ratio measured by presses on the member; stiffness [N/m], (m, m)."""
+    """`HealthyMap.grid` of a member: the template's, corrected by presses on the member, (m, m, 3)."""
     charted, own = charted_face(member), charted_face(template)
     sites = charted.grid_sites()
     places = np.array([own.chart.place(member.face.carried(site.point, template.face)) for site in sites])
-    expected = base.stiffness(np.clip(places, -1.0, 1.0))
+    inside = np.clip(places, -1.0, 1.0)
+    expected, centre = base.stiffness(inside), base.centre(inside)
     spread = far_apart(charted, sites)
     quick = quickened(member, progress)
-    stiffness = press_sites(quick, [sites[index] for index in spread], progress, np.float32, str(member.member))
-    log_ratio = log(stiffness / expected[spread])
+    presses = press_sites(quick, [sites[index] for index in spread], progress, np.float32, str(member.member))
+    log_ratio = log(presses[:, 0] / expected[spread])
+    differences = np.column_stack([log_ratio, presses[:, 1:] - centre[spread]])
     points = np.array([site.place for site in sites]) * charted.chart.extent / charted.chart.extent.max()
-    mean = float(log_ratio.mean())
+    mean = differences.mean(axis=0)
     weights = solve(
         _covariance(points[spread], points[spread]) + PRESS_SPREAD * PRESS_SPREAD * np.eye(len(spread)),
-        log_ratio - mean,
+        differences - mean,
     )
-    ratio = exp(mean + matmul(_covariance(points, points[spread]), weights))
-    return (expected * ratio).reshape(charted.chart.side_count, -1)
+    added = mean + matmul(_covariance(points, points[spread]), weights)
+    side = charted.chart.side_count
+    return np.column_stack([expected * exp(added[:, 0]), centre + added[:, 1:]]).reshape(side, side, 3)
 
 
 def _covariance(first: FloatArray, second: FloatArray) -> FloatArray:

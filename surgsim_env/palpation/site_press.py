@@ -70,6 +70,8 @@ class PressResult:
         fault: fault of the simulation, or an empty string
         duration: simulated time [s]
         workspace_limited: True if the instrument was stopped at a limit in a phase
+        taxels: forces on the taxels, mean of the last READINGS readings [N]       (n_patch, rows, columns, 3)
+        taxel_places: of the last reading, from the tip's pole [m]                 (n_patch, rows, columns, 3)
     """
 
     force: FloatArray
@@ -79,6 +81,8 @@ class PressResult:
     fault: str
     duration: float
     workspace_limited: bool = False
+    taxels: FloatArray | None = None
+    taxel_places: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +197,8 @@ class SitePress:
         self.simulation, self.point, self.normal = simulation, point, normal
         self.readings: list[tuple[FloatArray, float]] = []
         self.force_peak = 0.0
+        self._taxels: list[FloatArray] = []
+        self._taxel_places: FloatArray | None = None
         self._radius = scene.instrument.tip_radius
         self._hard_force = scene.limits.hard_force
         self._stopped = self._over = self._limited = False
@@ -240,6 +246,9 @@ class SitePress:
             surface = self.point + self.simulation.ground_shift(self.point)
             below = matmul(surface - self.simulation.instrument.tip_position, self.normal) + self._radius
             self.readings.append((self.simulation.contact_force, float(below)))
+            if (patches := self.simulation.instrument.patches) is not None:
+                self._taxels.append(patches.forces)
+                self._taxel_places = patches.places - self._pole
             self._over |= phase.settles and self._settled()
 
     def _settled(self) -> bool:
@@ -264,7 +273,24 @@ class SitePress:
             fault=fault,
             duration=self.simulation.time,
             workspace_limited=self._limited,
+            taxels=np.mean(self._taxels[-READINGS:], axis=0) if self._taxels and not fault else None,
+            taxel_places=self._taxel_places,
         )
+
+    @property
+    def centre(self) -> FloatArray:
+        """Centre of pressure from the tip's pole, sum f (x - pole) / sum f [m], (3,).
+
+        f is the force of each contact point on the tool against the scene's approach in the next substep.
+        """
+        points = self.simulation.contact_points()
+        push = -matmul(points.force, self.simulation.anatomy.face.approach)
+        return matmul(push, points.place - self._pole) / push.sum()
+
+    @property
+    def _pole(self) -> FloatArray:
+        """Point of the tip's ball that faces the organ [m], (3,)."""
+        return self.simulation.instrument.tip_position - self._radius * self.normal
 
 
 def press_alone(press: SitePress, phases: Sequence[PressPhase]) -> PressResult:

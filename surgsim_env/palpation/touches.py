@@ -22,6 +22,11 @@ from surgsim_env.scene.palpable_surface import hertz_force
 TRAVEL_SPEED = 0.02
 # Largest absolute log contrast; `Touch.cut` reports clipping.
 LOG_CONTRAST_BOUND = 2.0
+# Gain of the centre of pressure's shift over the gradient of the log contrast, as a share of the squared contact radius
+# tip radius x depth: 1/5 for Hertz's pressure with a stiffness linear across it, more as the ball also reaches below.
+GRADIENT_GAIN = 0.32
+# Largest absolute part of the gradient, in a tip radius.
+GRADIENT_BOUND = 4.0
 
 
 @dataclass(frozen=True)
@@ -34,8 +39,10 @@ class Touch:
         force: along the inward normal, through the sensor model [N].
         depth: of the tip [m].
         log_contrast: log of stiffness over healthy stiffness.
-        cut: True if the log contrast was clipped to its bound.
+        cut: True if the log contrast, or a part of the gradient, was clipped to its bound.
         stopped: True if force ended the motion inward before depth did.
+        gradient: of the log contrast along the chart's sides, from the shift of the centre of pressure [1/m]; 0 without
+            taxels.
     """
 
     place: tuple[float, float]
@@ -45,6 +52,7 @@ class Touch:
     log_contrast: float = 0.0
     cut: bool = False
     stopped: bool = False
+    gradient: tuple[float, float] = (0.0, 0.0)
 
     @property
     def stiffness(self) -> float:
@@ -71,23 +79,43 @@ class SiteTouches:
         self.touches: list[Touch] = []
         self.seconds = self.path_length = 0.0
         self._last_start: FloatArray | None = None
-        self._maps = np.zeros((2, len(self.charted.touch_map.pressable)))
+        self.taxels = np.zeros(0)
+        self._maps = np.zeros((4, len(self.charted.touch_map.pressable)))
 
     @property
     def last(self) -> Touch:
         """Last touch; zeros before the first."""
         return self.touches[-1] if self.touches else Touch((0.0, 0.0))
 
-    def add(self, site: Site, result: PressResult, force: float) -> None:
-        """Record a press at a site, with the sensor's reading of the force along the normal [N]."""
-        healthy = float(self.healthy.stiffness(site.place + 2.0 * self.map_shift / self.charted.chart.extent))
+    def add(self, site: Site, result: PressResult, force: float, taxels: FloatArray | None = None) -> None:
+        """Record a press at a site.
+
+        Args:
+            site: of the press.
+            result: of the press.
+            force: along the normal, through the sensor model [N].
+            taxels: forces on the taxels, through theirs [N], (n_patch, rows, columns, 3); None without.
+        """
+        on_map = site.place + 2.0 * self.map_shift / self.charted.chart.extent
+        healthy = float(self.healthy.stiffness(on_map))
         # The least contrast for a small force reversed by bias and noise, and for an arm stopped above the surface.
         contrast = force / (result.depth * healthy) if result.depth > 0.0 else 0.0
         log_contrast = float(log(contrast)) if contrast > 0.0 else -math.inf
         bounded = min(max(log_contrast, -LOG_CONTRAST_BOUND), LOG_CONTRAST_BOUND)
         u, v = site.place.tolist()
-        cut = bounded != log_contrast
-        self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped))
+        gradient, bound = np.zeros(2), GRADIENT_BOUND / self.charted.tip_radius
+        if taxels is not None:
+            assert result.taxel_places is not None
+            self.taxels, push = taxels, taxels[..., 2]
+            centre = (push[..., None] * self.charted.chart.along_axes(result.taxel_places)).sum(axis=(0, 1, 2))
+            total = float(push.sum())
+            # Noise alone has no centre.
+            if total > 0.0:
+                gradient = (centre / total - self.healthy.centre(on_map)) / self.gradient_gain
+        held = np.clip(gradient, -bound, bound)
+        cut = bounded != log_contrast or bool((held != gradient).any())
+        gu, gv = held.tolist()
+        self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped, (gu, gv)))
         self._mark(self.touches[-1])
         start = site.point + site.normal * self.palpation.clearance
         travel = 0.0 if self._last_start is None else math.dist(start, self._last_start)
@@ -107,8 +135,18 @@ class SiteTouches:
         """Log contrast of the presses, shape (n,)."""
         return np.array([touch.log_contrast for touch in self.touches])
 
+    @property
+    def gradient_gain(self) -> float:
+        """Shift of the centre of pressure over the gradient of the log contrast [m^2]."""
+        return GRADIENT_GAIN * self.charted.tip_radius * self.palpation.press_depth
+
+    @property
+    def gradients(self) -> FloatArray:
+        """Gradient of the log contrast at the presses along the chart's sides [1/m], shape (n, 2)."""
+        return np.array([touch.gradient for touch in self.touches]).reshape(-1, 2)
+
     def maps(self) -> FloatArray:
-        """Log contrast, and 1 for pressed sites, of the touch map, shape (2, n_site).
+        """Log contrast, 1 for pressed sites, and both parts of the gradient [1/m], of the touch map, (4, n_site).
 
         A site pressed again has its latest contrast.
         """
@@ -116,7 +154,7 @@ class SiteTouches:
 
     def _mark(self, touch: Touch) -> None:
         site = self.charted.touch_map.nearest(touch.place)
-        self._maps[:, site] = touch.log_contrast, 1.0
+        self._maps[:, site] = touch.log_contrast, 1.0, *touch.gradient
 
     def get_state(self) -> dict[str, Any]:
         """Record as a table for JSON."""
@@ -125,18 +163,21 @@ class SiteTouches:
             "way": [self.seconds, self.path_length],
             "last_start": None if self._last_start is None else self._last_start.tolist(),
             "map_shift": self.map_shift.tolist(),
+            "taxels": self.taxels.ravel().tolist(),
         }
 
     def set_state(self, table: Mapping[str, Any]) -> None:
         """Restore a record from `get_state`."""
         self.clear()
         for touch in table["touches"]:
-            self.touches.append(Touch(**{**touch, "place": tuple(touch["place"])}))
+            pairs = {name: tuple(touch[name]) for name in ("place", "gradient")}
+            self.touches.append(Touch(**{**touch, **pairs}))
             self._mark(self.touches[-1])
         self.seconds, self.path_length = table["way"]
         start = table["last_start"]
         self._last_start = None if start is None else np.array(start)
         self.map_shift = np.array(table["map_shift"])
+        self.taxels = np.array(table["taxels"])
 
 
 def felt_lesion_radius(scene: Scene) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, require_known, scenes_folder
-from surgsim_env.scene.model import Vector, require_direction, require_number
+from surgsim_env.scene.model import Taxels, Vector, require_direction, require_number
 
 KINDS = ("palpator", "grasper")
 CONTROL_MODES = ("position", "servo")
@@ -151,6 +151,7 @@ class ArmDescription:
         inertias: of links of a URDF file, in place of its own.
         dropped_meshes: file names of left out meshes of a URDF, as in the URDF.
         description: one line.
+        taxels: on the tip or the jaw's pads; a scene takes them into its `instrument`.
     """
 
     name: str
@@ -171,6 +172,7 @@ class ArmDescription:
     inertias: tuple[LinkInertia, ...] = ()
     dropped_meshes: tuple[str, ...] = ()
     description: str = ""
+    taxels: Taxels | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -80,8 +80,11 @@ class Level:
             drift=own.drift + self.sensor_drift * own.range,
             hysteresis=own.hysteresis + self.sensor_hysteresis * own.range,
         )
-        healthy = self.healthy(scene)
-        return replace(healthy, sensor=sensor, timing=replace(healthy.timing, mass_scaling=True))
+        healthy, instrument = self.healthy(scene), scene.instrument
+        if instrument.taxels is not None:
+            taxels = replace(instrument.taxels, noise=instrument.taxels.noise * self.sensor_noise)
+            instrument = replace(instrument, taxels=taxels)
+        return replace(healthy, sensor=sensor, instrument=instrument, timing=replace(healthy.timing, mass_scaling=True))
 
     def healthy(self, scene: Scene) -> Scene:
         """Scene with this level's healthy tissue, before an operation."""

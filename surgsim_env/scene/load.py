@@ -11,7 +11,7 @@ import dacite
 
 from msdm_core.errors import OrganError
 from msdm_core.mesh_files.mesh_file import checked_content
-from surgsim_env.scene.model import CARTESIAN, PAIRS, LibraryMaterial, Scene
+from surgsim_env.scene.model import CARTESIAN, PAIRS, TACTILE_PROBE, LibraryMaterial, Scene, Taxels
 
 Table = TypeVar("Table")
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
@@ -156,17 +156,35 @@ def make_scene(name: str | Path) -> Scene:
 
 
 def with_instrument(scene: Scene, instrument: str | None) -> Scene:
-    """Scene with another instrument: a name in CARTESIAN or PAIRS, an arm, its path, a pair; None: its own."""
+    """Scene with another instrument: a Cartesian one, an arm, its path, a pair of arms; None: its own.
+
+    Raises:
+        ValueError: an unknown name (lists the known ones, suggests the nearest).
+    """
     if instrument is None:
         return scene
-    known = [*CARTESIAN, *list_arms(), *PAIRS]
+    known = [*CARTESIAN, TACTILE_PROBE, *list_arms(), *PAIRS]
     if Path(instrument).suffix != ".toml" and instrument not in known and pair_names(str(instrument)) is None:
         raise ValueError(
             f"instrument {str(instrument)!r} is unknown{nearest(str(instrument), known)}; the instruments are "
             f"{', '.join(known)}, the path of an arm's TOML file, or two arms as LEFT+RIGHT"
         )
+    if instrument == TACTILE_PROBE:
+        taxels = scene.instrument.taxels or Taxels()
+        return replace(scene, instrument=replace(scene.instrument, model="probe.xml", taxels=taxels))
     model = f"{instrument}.xml" if instrument in CARTESIAN else str(instrument)
-    return replace(scene, instrument=replace(scene.instrument, model=model))
+    return _with_taxels(replace(scene, instrument=replace(scene.instrument, model=model, taxels=None)))
+
+
+def _with_taxels(scene: Scene) -> Scene:
+    """Scene with the taxels of its arm's file; another instrument keeps its own."""
+    name = scene.instrument.model
+    path = scenes_folder() / "instruments" / f"{name}.toml" if name in list_arms() else scene.folder / name
+    if path.suffix != ".toml" or not path.is_file():
+        return scene
+    entries = read_toml(path, "arm").get("taxels")
+    taxels = fill(Taxels, entries, f"arm {path.stem!r}: taxels") if isinstance(entries, dict) else None
+    return replace(scene, instrument=replace(scene.instrument, taxels=taxels))
 
 
 def pair_names(model: str) -> tuple[str, str] | None:
@@ -192,7 +210,7 @@ def scene_from_table(table: dict[str, Any], *, name: str, folder: Path) -> Scene
     """
     table = _with_template(table, f"scene {name!r}", folder)
     table = _with_library_materials(table, f"scene {name!r}", folder)
-    return fill(Scene, {**table, "name": name, "folder": folder}, f"scene {name!r}")
+    return _with_taxels(fill(Scene, {**table, "name": name, "folder": folder}, f"scene {name!r}"))
 
 
 def _with_template(table: dict[str, Any], source: str, folder: Path) -> dict[str, Any]:

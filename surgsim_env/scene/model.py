@@ -237,8 +237,50 @@ class Contact:
 
 # Instruments on slides; their models are NAME.xml in scenes/instruments.
 CARTESIAN = ("probe", "grasper")
+# A probe with a patch of taxels: the scene's, or that of the defaults.
+TACTILE_PROBE = "tactile_probe"
+# Default pitch of taxels over the tip's radius: four span a press on a face tilted by up to 30 degrees.
+PITCH_SHARE = 0.6
+TAXELS_MOST = 64
 # Instruments of two arms, left and right; for other pairs "LEFT+RIGHT", see `load.pair_names`.
 PAIRS = {"psm_pair": ("psm_retractor", "psm_palpator")}
+
+
+@dataclass(frozen=True)
+class Taxels:
+    """Patch of taxels, rows x columns square cells of force sensing, on a ball's cap, a flat palpator or a jaw's pads.
+
+    Reading of a taxel: its force on three axes, (1 - c) f + c times the mean of the four neighbours, at the border a
+    taxel's own for a missing one, + drift x time + noise, clipped at +-range and flagged.
+
+    Args:
+        rows, columns: of a patch.
+        pitch: distance between neighbours [m]; by default PITCH_SHARE of the tip's radius.
+        noise: standard deviation of each reading on each axis [N].
+        drift: largest rate of a taxel's bias [N/s]; each episode draws them uniformly from [-drift, drift].
+        cross_talk: c, the share of the neighbours, below 1.
+        range: largest reading on each axis [N].
+    """
+
+    rows: int = 4
+    columns: int = 4
+    pitch: float | None = None
+    noise: float = 0.001
+    drift: float = 0.0
+    cross_talk: float = 0.0
+    range: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("rows", "columns"):
+            if not 1 <= getattr(self, name) <= TAXELS_MOST:
+                raise ValueError(f"taxels.{name} is {getattr(self, name)}; it must be from 1 to {TAXELS_MOST}")
+        if self.pitch is not None:
+            require_number("taxels.pitch", self.pitch, 0.0, "m", above=True)
+        require_number("taxels.noise", self.noise, 0.0, "N")
+        require_number("taxels.drift", self.drift, 0.0, "N/s")
+        require_number("taxels.range", self.range, 0.0, "N", above=True)
+        if not 0.0 <= self.cross_talk < 1.0:
+            raise ValueError(f"taxels.cross_talk is {self.cross_talk:g}; it must be at least 0 and below 1")
 
 
 @dataclass(frozen=True)
@@ -251,12 +293,14 @@ class SceneInstrument:
         tip_radius: of the ball tip [m].
         approach: direction of its motion to the organ, and of its shaft.
         tip_direction: direction of a grasper's jaw and an arm's tip; by default the approach.
+        taxels: on the tip or the jaw's pads; of an arm those of its own file.
     """
 
     model: str = "probe.xml"
     tip_radius: float = 0.008
     approach: Vector = (0.0, 0.0, -1.0)
     tip_direction: Vector | None = None
+    taxels: Taxels | None = None
 
     def __post_init__(self) -> None:
         require_number("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True)

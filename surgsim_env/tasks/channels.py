@@ -1,5 +1,7 @@
 """Observation channels and reward values shared by tasks."""
 
+import math
+
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, Channel, ControlStep
 from surgsim_env.tasks.task import Task
@@ -34,6 +36,13 @@ CONTACT_FORCE = Channel(
     read=lambda task, simulation: simulation.contact_force,
     meaning="contact force on the tip, mean of the last haptic step, through the sensor model",
     scale=force_scale, scale_text="soft limit",
+)  # fmt: skip
+TAXELS = Channel(
+    "taxels", lambda task: math.prod(task.taxel_shape), "N", taxels=True,
+    read=lambda task, simulation: simulation.taxels.ravel(),
+    meaning="force on each taxel of the instrument, row by row: along the row, along the column and into the tool, "
+    "mean of the last haptic step, through the taxels' sensor model",
+    size_text="3 a taxel", scale=force_scale, scale_text="soft limit",
 )  # fmt: skip
 TIME_LEFT = Channel(
     "time_left", 1, "", 0.0, 1.0,

@@ -82,6 +82,8 @@ class Channel:
         scale: value observed as 1, in the form of a bound; required with a unit
         origin: value observed as 0, likewise
         late_bias: True if the sensor's bias is drawn after the task's `draw`, not before
+        taxels: True for forces of the instrument's taxels, through their sensor model; bounds are plus and minus their
+            range
     """
 
     name: str
@@ -99,6 +101,7 @@ class Channel:
     origin: Bound = 0.0
     scale_text: str = "by the scene"
     late_bias: bool = False
+    taxels: bool = False
 
     def __post_init__(self) -> None:
         if self.scale is None:
@@ -119,6 +122,11 @@ class Channel:
                     f"channel {self.name!r}: sensor is {self.sensor!r} with size {self.size!r}; the force sensor has "
                     "three axes and its factor is a finite number above 0: give size 3, or no sensor"
                 )
+        elif self.taxels:
+            object.__setattr__(self, "felt", True)
+            object.__setattr__(self, "low", lambda task, _: -task.anatomy.scene.instrument.taxels.range)
+            object.__setattr__(self, "high", lambda task, _: task.anatomy.scene.instrument.taxels.range)
+            object.__setattr__(self, "bounds_text", "+-range")
         elif self.low is None or self.high is None:
             raise ValueError(f"channel {self.name!r} has no bounds: give low and high, finite numbers or functions")
 

@@ -20,7 +20,7 @@ class TaskLayout:
         action_slices: entries of an action, by the command's name
         observation_slices: entries of an observation, by the channel's name
         observed: channels of an observation, with their sizes
-        sensed: those with a sensor
+        sensed: those with a sensor, with their sizes
     """
 
     def __init__(self, task: Task) -> None:
@@ -31,7 +31,7 @@ class TaskLayout:
         sized = ((channel, _size(channel, task)) for channel in task.channels)
         self.observed: tuple[tuple[Channel, int], ...] = tuple((channel, size) for channel, size in sized if size)
         self.observation_slices = _slices((channel.name, size) for channel, size in self.observed)
-        self.sensed = tuple(channel for channel, _ in self.observed if channel.sensor)
+        self.sensed = tuple((channel, size) for channel, size in self.observed if channel.sensor or channel.taxels)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """The task, laid out anew: the functions of its class's declaration cannot be pickled."""
@@ -103,10 +103,10 @@ class TaskLayout:
         Raises:
             ValueError: a channel's `read` returns other than real numbers, or another size.
         """
-        sensed = self._task.sensed
+        sensed, names = self._task.sensed, {channel.name for channel, _ in self.sensed}
         return np.concatenate(
             [
-                sensed[channel.name] if channel.sensor else self.reading(channel, size, simulation)
+                sensed[channel.name] if channel.name in names else self.reading(channel, size, simulation)
                 for channel, size in self.observed
             ]
         )

@@ -17,6 +17,7 @@ from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import require_known
 from surgsim_env.tasks.channels import (
     CONTACT_FORCE,
+    TAXELS,
     TIME_LEFT,
     TIP_POSITION,
     TIP_VELOCITY,
@@ -131,9 +132,9 @@ class PalpateTask(Task):
 
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".
-    * `instrument`: "probe", the name of an arm (`surgsim_env.list_arms()`, such as "psm_palpator") or the path of an
-      arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the body at the scene's `[port]`, and
-      its tip points along the scene's approach as far as its joints allow.
+    * `instrument`: "probe", "tactile_probe" (a probe with taxels), the name of an arm (`surgsim_env.list_arms()`, such
+      as "psm_palpator") or the path of an arm's TOML file (docs/arms.md); by default the scene's own. An arm enters the
+      body at the scene's `[port]`, and its tip points along the scene's approach as far as its joints allow.
     * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
     * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
       ranges.
@@ -231,6 +232,7 @@ class PalpateTask(Task):
             meaning='with `frame="face"` and `memory`: lengths of the chart\'s sides over the map\'s',
             size_text="2 or 0",
         ),
+        TAXELS,
     )  # fmt: skip
     rewards = (
         Reward("time", -0.005, "step", "each control step, times 600 over those of the episode", _step_weight),

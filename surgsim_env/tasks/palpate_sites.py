@@ -8,16 +8,16 @@ import numpy as np
 
 from msdm_core.arithmetic import exp, matmul
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.sensors import ForceReading
+from surgsim_env.coupling.sensors import ForceReading, TaxelReading
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, Site, charted_face, healthy_map_of
 from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimate, LesionEstimator
 from surgsim_env.palpation.member_chart import member_map, still_template
 from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
 from surgsim_env.palpation.site_press import PressResult
-from surgsim_env.palpation.touches import LOG_CONTRAST_BOUND, SiteTouches, Touch, felt_lesion_radius
+from surgsim_env.palpation.touches import GRADIENT_BOUND, LOG_CONTRAST_BOUND, SiteTouches, Touch, felt_lesion_radius
 from surgsim_env.scene.levels import REFERENCE_TIP
-from surgsim_env.tasks.channels import soft_force_share
+from surgsim_env.tasks.channels import force_scale, soft_force_share
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, Setup
 from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
@@ -109,7 +109,8 @@ class PalpateSitesTask(Task):
     * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.
     * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
       of which each episode draws one; `info["member"]` names it.
-    * `instrument`: "probe", the name of an arm or the path of an arm's TOML file; by default the scene's own.
+    * `instrument`: "probe", "tactile_probe" (a probe with taxels), the name of an arm or the path of an arm's TOML
+      file; by default the scene's own.
 
     ## Version History
     * v0: first version.
@@ -179,6 +180,28 @@ class PalpateSitesTask(Task):
             "presses_left", 1, "", 0.0, 1.0, read=lambda task, simulation: 1.0 - task.step_count / task.budget,
             meaning="share of the presses left",
         ),
+        Channel(
+            "gradient_map", lambda task: 2 * _map_size(task) if task.taxel_reading is not None else 0, "",
+            -GRADIENT_BOUND, GRADIENT_BOUND, felt=True,
+            read=lambda task, simulation: task.charted.tip_radius * task.felt.maps()[2:].ravel(),
+            meaning="with taxels: gradient of the log contrast along the chart's first and then its second axis, times "
+            "the tip's radius, at each site", size_text="2 n n or 0",
+        ),
+        Channel(
+            "gradient_noise", lambda task: int(task.memory and task.taxel_reading is not None), "", 0.0, NOISE_BOUND,
+            read=lambda task, simulation: task.charted.tip_radius * task.estimator.gradient_noise,
+            meaning="with taxels: standard deviation of one gradient by their noise, times the tip's radius",
+            size_text="1 or 0",
+        ),
+        Channel(
+            "taxels", lambda task: math.prod(task.taxel_shape), "N",
+            lambda task, instrument: -task.anatomy.scene.instrument.taxels.range,
+            lambda task, instrument: task.anatomy.scene.instrument.taxels.range,
+            read=lambda task, simulation: task.felt.taxels if task.felt.taxels.size else np.zeros(task.taxel_shape),
+            felt=True, meaning="forces of the last press on the taxels, row by row: along the row, along the column "
+            "and into the tool, through their sensor model", size_text="3 a taxel", bounds_text="+-range",
+            scale=force_scale, scale_text="soft limit",
+        ),
     )  # fmt: skip
     # `error`, `soft_force` and `forgone` are in [0, 1] per press and count as shares of the budget of n presses: 0.04,
     # 0.01 and 0.05 a press for n = 25.
@@ -245,7 +268,9 @@ class PalpateSitesTask(Task):
         if budget is not None and budget < 1:
             raise ValueError(f"budget is {budget!r}; it must be a whole number of presses, at least 1")
         self.given_budget = budget
-        self.reading = ForceReading(scene.sensor)
+        self._patches = None if scenario.instrument is None else scenario.instrument.patches
+        self.reading, taxels = ForceReading(scene.sensor), scene.instrument.taxels
+        self.taxel_reading = None if taxels is None else TaxelReading(taxels, self.taxel_shape)
         self.cutoff, self.tip_scale = ospa_cutoff(tip), tip / REFERENCE_TIP
         assert scenario.level is not None and scenario.scene is not None
         # The healthy maps of the scene and of a family's members belong to this anatomy.
@@ -261,15 +286,28 @@ class PalpateSitesTask(Task):
         wide = chart.extent.max() > WIDE * scene.instrument.tip_radius
         self.budget = self.given_budget if self.given_budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
-        healthy_force = float(healthy.grid.mean()) * scene.palpation.press_depth
+        healthy_force = float(healthy.grid[:, :, 0].mean()) * scene.palpation.press_depth
         self.estimator = LesionEstimator(
             chart.extent,
             lesion_radius=felt_lesion_radius(scene),
             noise=scene.sensor.noise / healthy_force,
             map_spread=0.0 if scene.mesh.block is not None else ORGAN_MAP_SPREAD,
+            gradient_noise=self._gradient_noise(healthy_force),
         )
         self.truth = np.zeros((0, 3))
         self._believe()
+
+    def _gradient_noise(self, force: float) -> float:
+        """Standard deviation of a gradient by the taxels' noise under a force [N] [1/m]; 0 without taxels.
+
+        The centre of pressure sum N_i x_i / sum N_i has s sqrt(sum x_i^2) / F.
+        """
+        if self._patches is None:
+            return 0.0
+        places = self._patches.places
+        away = self.charted.chart.along_axes(places - places.mean(axis=(0, 1, 2)))
+        width = math.sqrt(0.5 * float((away * away).sum()))
+        return self._patches.taxels.noise * width / force / self.felt.gradient_gain
 
     # ---- the episode ------------------------------------------------------------------------------------------------
 
@@ -279,6 +317,8 @@ class PalpateSitesTask(Task):
             self._chart()
         self.truth = self.drawn.places(self.anatomy)
         self.reading.reset(rng)
+        if self.taxel_reading is not None:
+            self.taxel_reading.reset(rng)
         assert self.level is not None
         if self.level.map_error:
             self.felt.map_shift = rng.normal(0.0, self.level.map_error, 2)
@@ -300,13 +340,18 @@ class PalpateSitesTask(Task):
         # Between presses the sensor bears nothing.
         self.reading.follow(np.zeros(3))
         reading, saturated = self.reading.read(result.force, rng, self.felt.seconds)
-        self.felt.add(site, result, float(matmul(reading, site.normal)))
+        taxels = None
+        if self.taxel_reading is not None and result.taxels is not None:
+            taxels, cut = self.taxel_reading.read(result.taxels, rng, self.felt.seconds)
+            saturated = saturated or cut
+        self.felt.add(site, result, float(matmul(reading, site.normal)), taxels)
         self._believe()
         return saturated
 
     def _believe(self) -> None:
         """Estimate the lesions from all touches, and compare with the truth."""
-        self.estimate: LesionEstimate = self.estimator.estimate(self.felt.places, self.felt.log_contrasts)
+        felt = self.felt
+        self.estimate: LesionEstimate = self.estimator.estimate(felt.places, felt.log_contrasts, felt.gradients)
         self.estimated = self.charted.surface(2.0 * self.estimate.points / self.charted.chart.extent - 1.0)
         self.error = ospa(self.truth, self.estimated, self.cutoff)
         self.found = self._found_share()
@@ -352,13 +397,16 @@ class PalpateSitesTask(Task):
     @property
     def record(self) -> dict[str, Any]:
         """Record of the readings and the sensor's bias, as a table for JSON."""
-        return {"bias": self.reading.get_state(), **self.felt.get_state()}
+        drift = [] if self.taxel_reading is None else self.taxel_reading.get_state()
+        return {"bias": self.reading.get_state(), "drift": drift, **self.felt.get_state()}
 
     @record.setter
     def record(self, table: dict[str, Any]) -> None:
         if self.charted is not charted_face(self.anatomy):
             self._chart()
-        self.reading = ForceReading(self.reading.sensor, table["bias"])
+        self.reading = self.reading.restored(table["bias"])
+        if self.taxel_reading is not None:
+            self.taxel_reading = self.taxel_reading.restored(table["drift"])
         self.felt.set_state(table)
         self.truth = self.drawn.places(self.anatomy)
         self._believe()

@@ -14,7 +14,7 @@ import numpy as np
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.measure import TissueLoad
-from surgsim_env.coupling.sensors import ForceReading
+from surgsim_env.coupling.sensors import ForceReading, TaxelReading
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.scene.anatomy import Anatomy, load_anatomy
@@ -64,7 +64,13 @@ class TaskRuntime:
         self.task, self.family = task, family
         self.layout = TaskLayout(task)
         own = task.anatomy.scene.sensor
-        self.sensors = {channel.name: ForceReading(_scaled(own, channel.sensor)) for channel in self.layout.sensed}
+        taxels, shape = task.anatomy.scene.instrument.taxels, task.taxel_shape
+        self.sensors: dict[str, ForceReading | TaxelReading] = {
+            channel.name: TaxelReading(taxels, shape)
+            if channel.taxels and taxels is not None
+            else ForceReading(_scaled(own, channel.sensor))
+            for channel, _ in self.layout.sensed
+        }
         declared = [reward.name for reward in task.rewards if reward.per == "failure"]
         for reward in task.rewards:
             if reward.per == "step left" and reward.value is None and task.episode_steps is None:
@@ -142,7 +148,7 @@ class TaskRuntime:
         self.task.drawn, self.task.lesions = drawn, drawn.lesions
 
     def _draw_biases(self, rng: np.random.Generator, *, late: bool) -> None:
-        for channel in self.layout.sensed:
+        for channel, _ in self.layout.sensed:
             if channel.late_bias is late:
                 self.sensors[channel.name].reset(rng)
 
@@ -158,8 +164,8 @@ class TaskRuntime:
             ValueError: a channel's `read` returns other than real numbers, or another size.
         """
         task, simulation, saturated = self.task, step.simulation, False
-        for channel in self.layout.sensed:
-            value = self.layout.reading(channel, 3, simulation)
+        for channel, size in self.layout.sensed:
+            value = self.layout.reading(channel, size, simulation)
             task.sensed[channel.name], cut = self.sensors[channel.name].read(value, rng, simulation.time)
             saturated = saturated or cut
         task.update(step)
@@ -302,7 +308,7 @@ class TaskRuntime:
         self._take(saved["drawn"])
         task.step_count, task.sensed, self._reached = saved["step_count"], saved["sensed"], saved["reached"]
         for name, state in saved["bias"].items():
-            self.sensors[name] = ForceReading(self.sensors[name].sensor, state)
+            self.sensors[name] = self.sensors[name].restored(state)
         for name, value in saved["kept"].items():
             setattr(task, name, value)
 

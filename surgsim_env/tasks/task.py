@@ -66,6 +66,7 @@ class Task:
         drawn: the organ of the episode; None before the first
         lesions: of the episode; none before the first
         sensed: last readings of the channels with a sensor, by name [N, N m]
+        taxel_shape: shape of the taxels' forces (`Simulation.taxels`), of 0 numbers without taxels
         step_count: control steps of the episode so far
         episode_steps: control steps until an episode is truncated; None where the task ends it by itself
     """
@@ -102,6 +103,8 @@ class Task:
         self.sensed: dict[str, NDArray[np.float64]] = {
             channel.name: np.zeros(3) for channel in self.channels if channel.sensor
         }
+        patches = None if scenario.instrument is None else scenario.instrument.patches
+        self.taxel_shape = (0, 0, 0, 3) if patches is None else patches.shape
         self.step_count = 0
         self.episode_steps = self.setup.episode_steps
 

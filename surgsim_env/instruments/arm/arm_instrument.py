@@ -93,6 +93,7 @@ class ArmInstrument(SteeredArms):
         self.parked = parked_place(anatomy)
         self._check_reach(anatomy)
         self.place(self.parked)
+        self.set_patches(scene.instrument, matmul(self.data.site_xmat[arm.tip_site].reshape(3, 3), arm.tip_axis))
 
     def place(self, position: FloatArray) -> None:
         """Place the tip at rest at a position [m], in the start direction as far as the joints allow.

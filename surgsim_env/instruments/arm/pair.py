@@ -63,6 +63,11 @@ class Pair(SteeredArms):
                 "left arm's first: add them, or take a scene that has them, such as 'lobe'"
             )
         arms = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
+        if any(arm.description.taxels is not None for arm in arms.values()):
+            raise ValueError(
+                f"scene {scene.name!r}: an arm of {scene.instrument.model!r} has [taxels], which a pair does not read: "
+                "take the arm alone, or leave them out of its file"
+            )
         with warned(f"scene {scene.name!r}"):
             model = _compile(arms, scene)
         super().__init__(model, lower, upper, model.site(f"left_{arms['left'].description.tip.site}").id)

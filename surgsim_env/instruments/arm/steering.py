@@ -17,7 +17,8 @@ from surgsim_env.instruments.arm.inverse_kinematics import (
     turn_matrix,
     turn_towards,
 )
-from surgsim_env.instruments.instrument import Instrument, Jaw, frame_along
+from surgsim_env.instruments.instrument import Instrument, Jaw
+from surgsim_env.instruments.tool_bodies import frame_along
 
 # Tolerance of a reached position [m]; the direction is as the joints allow.
 PLACE_TOLERANCE = 1e-6

@@ -170,7 +170,8 @@ class TaskLayout:
 
 def channel_slices(task_class: type[Task], **sizes: int) -> dict[str, slice]:
     """Slices of a task's observation without an episode; `sizes` are those of channels with a function for a size."""
-    return _slices((channel.name, sizes.get(channel.name, channel.size)) for channel in task_class.channels)
+    given = {channel.name: 0 if callable(channel.size) else channel.size for channel in task_class.channels} | sizes
+    return _slices(given.items())
 
 
 def _axes(command: Command, task: Task) -> FloatArray | None:

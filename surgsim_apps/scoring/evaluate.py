@@ -226,7 +226,7 @@ def find_player(name: str, options: ScoringOptions) -> Player:
 
 def _strangers_player(name: str, options: ScoringOptions) -> Player:
     env_id = options.env or SITES
-    for argument in (*PLACES, "split", "motion", "budget"):
+    for argument in (*PLACES, "split", "motion", "instrument", "budget"):
         if argument in options.env_kwargs and getattr(options, argument) is not None:
             raise ValueError(f"{argument} is given by --{argument} and in --env-arguments: leave one out")
     own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
@@ -295,6 +295,8 @@ def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
     kwargs = dict(player.kwargs)
     if options.motion is not None:
         kwargs["motion"] = options.motion
+    if options.instrument is not None:
+        kwargs["instrument"] = options.instrument
     if options.budget is not None:
         if player.env_id != SITES:
             raise ValueError(f"--budget is the number of presses of {SITES}; {player.name} plays {player.env_id}")
@@ -312,7 +314,8 @@ def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
 def evaluate(player: Player, options: ScoringOptions, console: Console) -> Result:
     """Play the seeds of the options; print the result and write its file."""
     kwargs, seeds, env_id, actor = _arguments(player, options), options.played_seeds, player.env_id, player.actor
-    name = player.name + "_untracked" * options.no_tracking
+    suffixes = ("untracked" * options.no_tracking, Path(options.instrument or "").stem)
+    name = "_".join([player.name, *filter(None, suffixes)])
     rng = np.random.default_rng(BOOTSTRAP_SEED)
     count = 1 if actor is None else min(options.envs, len(seeds))
     try:

@@ -22,6 +22,8 @@ class ScoringOptions:
     """Of a family of organs: train, validation or test (the default)."""
     motion: str | None = None
     """Motion of the patient; default: the scene's."""
+    instrument: str | None = None
+    """Such as tactile_probe, or an arm; default: the scene's, for a policy that of its training."""
     no_tracking: bool = False
     """Presses and oracles go where the surface is at rest, as it moves."""
     seeds: str | None = None

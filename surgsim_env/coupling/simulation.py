@@ -37,7 +37,7 @@ WORKSPACE_MARGIN = 0.04
 
 
 class HapticRecord:
-    """Time, wrench and tip pose at the end of each recorded haptic step; recording does not change the episode.
+    """Time, wrench, taxels and tip pose at the end of each recorded haptic step; recording does not change the episode.
 
     After mj_step2 MuJoCo's coordinates belong to the end of the step and its poses to the start. The tip's pose is
     therefore computed from the coordinates in an MjData of the record's own; the instrument's data are not written.
@@ -49,6 +49,7 @@ class HapticRecord:
         self._data = mujoco.MjData(instrument.model)
         self._time: list[float] = []
         self._wrench: list[FloatArray] = []
+        self._taxels: list[FloatArray] = []
         self._position: list[FloatArray] = []
         self._orientation: list[FloatArray] = []
         self._touching: list[int] = []
@@ -65,6 +66,8 @@ class HapticRecord:
             self._touching.append(len(self))
         self._time.append(time)
         self._wrench.append(wrench.copy())
+        if self.instrument.patches is not None:
+            self._taxels.append(self.instrument.patches.forces)
         self._position.append(position)
         self._orientation.append(orientation)
 
@@ -82,6 +85,11 @@ class HapticRecord:
     def wrench(self) -> FloatArray:
         """Mean force [N] of the tissue, and torque about the centre of mass [N m], on each tool, (n, n_tool, 6)."""
         return np.array(self._wrench).reshape(-1, self.instrument.tool_count, 6)
+
+    @property
+    def taxels(self) -> FloatArray:
+        """Force on each taxel [N] (`Simulation.taxels`), (n, n_patch, rows, columns, 3); 0 numbers without taxels."""
+        return np.array(self._taxels).reshape(len(self), *self.instrument.taxel_shape)
 
     @property
     def tip_position(self) -> FloatArray:

@@ -17,6 +17,8 @@ from surgsim_env.scene.model import SceneInstrument
 if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
+# Shape of the forces of no taxels: 0 numbers.
+NO_TAXELS = (0, 0, 0, 3)
 # Time from open to closed [s].
 STROKE_TIME = 0.5
 
@@ -198,6 +200,11 @@ class Instrument(ToolBodies):
         self.lower, self.upper = lower, upper
         self.jaw: Jaw | None = None
         self._tip = tip_site
+
+    @property
+    def taxel_shape(self) -> tuple[int, int, int, int]:
+        """Shape of the taxels' forces (`TaxelPatches.forces`)."""
+        return NO_TAXELS if self.patches is None else self.patches.shape
 
     @property
     def workspace_limited(self) -> bool:

@@ -124,6 +124,7 @@ class _Run:
             start=self.start,
             haptic_time=record.time,
             wrench=record.wrench,
+            taxels=record.taxels,
             tip_position=record.tip_position,
             tip_orientation=record.tip_orientation,
             depth=contact_depth(record.wrench, record.tip_position, simulation.anatomy.face.approach),

@@ -37,6 +37,7 @@ class Trace:
         start: its beginning since the episode's reset [s], as all times here
         haptic_time: end of each haptic step [s]                                                          (n,)
         wrench: tissue's mean force [N], torque about the centre of mass [N m] on each tool               (n, n_tool, 6)
+        taxels: force on each taxel, `Simulation.taxels` [N]                            (n, n_patch, rows, columns, 3)
         tip_position: centre of the tip ball [m]                                                          (n, 3)
         tip_orientation: unit quaternion (w, x, y, z), the tip's axes in the world                        (n, 4)
         depth: of the tip past the beginning of the current contact, along the approach [m]; 0 without contact  (n,)
@@ -53,6 +54,7 @@ class Trace:
     start: float
     haptic_time: FloatArray
     wrench: FloatArray
+    taxels: FloatArray
     tip_position: FloatArray
     tip_orientation: FloatArray
     depth: FloatArray
@@ -101,7 +103,7 @@ class Trace:
         begin, end = self._index(first), self._index(first if last is None else last)
         start, stop = self.steps[begin].start, self.steps[end].end
         haptic, control = _within(self.haptic_time, start, stop), _within(self.control_time, start, stop)
-        at_haptic_rate = ("haptic_time", "wrench", "tip_position", "tip_orientation", "depth")
+        at_haptic_rate = ("haptic_time", "wrench", "taxels", "tip_position", "tip_orientation", "depth")
         at_control_rate = ("control_time", "observation", "action", "reward", "infos")
         return replace(
             self,
@@ -171,11 +173,13 @@ WRENCH_COLUMNS = ("force_x_N", "force_y_N", "force_z_N", "torque_x_Nm", "torque_
 def _haptic_rows(trace: Trace) -> Iterator[list]:
     """Names of the columns, then a row for each haptic step."""
     wrenches = [f"{tool}_{column}" for tool in trace.tool_names for column in WRENCH_COLUMNS]
-    yield ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches]
+    taxels = [f"taxel_{'_'.join(map(str, place))}_N" for place in np.ndindex(trace.taxels.shape[1:])]
+    yield ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches, *taxels]
     names, sizes = trace.step_names(trace.haptic_time), trace.force_size.tolist()
     for row, time in enumerate(trace.haptic_time.tolist()):
         pose = [*trace.tip_position[row].tolist(), *trace.tip_orientation[row].tolist()]
-        yield [time, names[row], *pose, float(trace.depth[row]), sizes[row], *trace.wrench[row].ravel().tolist()]
+        forces = [*trace.wrench[row].ravel().tolist(), *trace.taxels[row].ravel().tolist()]
+        yield [time, names[row], *pose, float(trace.depth[row]), sizes[row], *forces]
 
 
 def _control_rows(trace: Trace) -> Iterator[list]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
-from surgsim_env.instruments.instrument import Instrument
+from surgsim_env.instruments.instrument import NO_TAXELS, Instrument
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.family import OrganFamily
 from surgsim_env.scene.levels import Level
@@ -103,8 +103,7 @@ class Task:
         self.sensed: dict[str, NDArray[np.float64]] = {
             channel.name: np.zeros(3) for channel in self.channels if channel.sensor
         }
-        patches = None if scenario.instrument is None else scenario.instrument.patches
-        self.taxel_shape = (0, 0, 0, 3) if patches is None else patches.shape
+        self.taxel_shape = NO_TAXELS if scenario.instrument is None else scenario.instrument.taxel_shape
         self.step_count = 0
         self.episode_steps = self.setup.episode_steps
 

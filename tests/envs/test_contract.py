@@ -33,6 +33,8 @@ CASES = [(env_id, SETTINGS.get(env_id, {})) for env_id in IDS] + [
     ("SurgSim/Palpate-v0", {"scene": "phantom", "instrument": "psm_palpator"}),
     pytest.param(("SurgSim/Retract-v0", {"instrument": "psm_retractor"}), marks=pytest.mark.slow),
     ("SurgSim/Palpate-v0", {"scene": "kidney_family"}),
+    ("SurgSim/Palpate-v0", {"scene": "phantom_small", "instrument": "tactile_probe"}),
+    ("SurgSim/PalpateSites-v0", {"scene": "phantom_small", "instrument": "tactile_probe", "budget": 20}),
     # All that an episode may remember, draw and follow.
     (
         "SurgSim/Palpate-v0",
@@ -75,7 +77,9 @@ STILL = {
             "contrast_noise[0]",
             "excess_least[0]",
             "lesion_radius[0]",
+            "gradient_noise[0]",
         ),
+        *(f"gradient_map[{entry}]" for entry in range(2 * MAP_SIDE**2)),
     },
     "SurgSim/Retract-v0": HINGE | UNSEEN,
     "SurgSim/BimanualRetract-v0": UNSEEN | {"touch_force[0]", "uncovered[0]"},

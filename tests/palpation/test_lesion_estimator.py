@@ -110,3 +110,69 @@ def test_a_map_that_deviates_asks_for_more_excess() -> None:
     assert doubtful.excess_least == pytest.approx(estimator().excess_least + module.EXCESS_LEAST_MAP * 0.05)
     assert estimator().excess_least < plain.strength[0] < doubtful.excess_least
     assert len(doubtful.estimate(places, values).points) == 0
+
+
+# ---- gradients by taxels ---------------------------------------------------------------------------------------------
+
+
+def feeling(noise: float = 2.0) -> LesionEstimator:
+    return LesionEstimator(EXTENT, lesion_radius=LESION_RADIUS, noise=NOISE, gradient_noise=noise)
+
+
+def slopes(places: np.ndarray, centres: list[tuple[float, float]], step: float = 1e-6) -> np.ndarray:
+    """Gradient of `bumps` by central differences [1/m]."""
+    ways = step * np.eye(2)
+    return np.stack([(bumps(places + way, centres) - bumps(places - way, centres)) / (2.0 * step) for way in ways], 1)
+
+
+def test_covariance_of_gradients_is_the_derivative_of_the_excess() -> None:
+    """Central differences of the plain process' covariance, by the first place, the second and both."""
+    process, plain = feeling().process, estimator().process
+    (first, _), (second, _) = scattered(4), scattered(3)
+    step = 1e-6
+    ways = [step * way for way in np.eye(2)]
+
+    def slope_of(function, places: np.ndarray, way: np.ndarray) -> np.ndarray:
+        return (function(places + way) - function(places - way)) / (2.0 * step)
+
+    rows = [lambda a, b: plain.excess_covariance(a, b)]
+    rows += [lambda a, b, way=way: slope_of(lambda x: plain.excess_covariance(x, b), a, way) for way in ways]
+    expected = np.block(
+        [
+            [row(first, second), *(slope_of(lambda x, row=row: row(first, x), second, way) for way in ways)]
+            for row in rows
+        ]
+    )
+    measured = process.excess_covariance(first, second)
+    scale = np.abs(measured).max(initial=0.0)
+    np.testing.assert_allclose(measured, expected, rtol=0, atol=1e-4 * scale)
+
+
+def test_posterior_with_gradients_is_that_of_the_joint_normal() -> None:
+    """Mean and deviation at the map's points, with the covariance of excess and gradients written out."""
+    made, (places, values) = feeling(), scattered(6)
+    gradients = np.random.default_rng(1).normal(0.0, 30.0, (6, 2))
+    points = map_points(made)
+    whole = made.process.excess_covariance(np.vstack([places, points]), np.vstack([places, points]))
+    count = len(places) + len(points)
+    own = np.concatenate([np.arange(6), count + np.arange(6), 2 * count + np.arange(6)])
+    noise = np.diag(np.repeat([NOISE**2 + module.MODEL_SPREAD**2, made.process.gradient_variance], [6, 12]))
+    noise[:6, :6] += module.BACKGROUND_SPREAD**2
+    inverse = np.linalg.inv(whole[np.ix_(own, own)] + noise)
+    between = whole[np.ix_(np.arange(6, count), own)]
+    _, excess = made.process.mean(places, values, gradients)
+    expected = between @ inverse @ np.concatenate([values, *gradients.T])
+    np.testing.assert_allclose(excess.ravel(), expected, atol=1e-8)
+    spread = np.sqrt(module.EXCESS_SPREAD**2 - np.einsum("ij,jk,ik->i", between, inverse, between))
+    np.testing.assert_allclose(made.process.spread(places).ravel(), spread, atol=1e-8)
+
+
+def test_a_press_beside_a_lesion_tells_its_direction() -> None:
+    """Two presses, both on the near side: with gradients the largest excess lies beyond them, towards the lesion."""
+    lesion, places = [(0.026, 0.022)], np.array([[0.018, 0.014], [0.006, 0.036]])
+    made, values = feeling(), bumps(places, lesion)
+    _, felt = made.process.mean(places, values, slopes(places, lesion))
+    _, plain = estimator().process.mean(places, values)
+    peak, blind = (map_points(made)[excess.argmax()] for excess in (felt, plain))
+    assert np.linalg.norm(peak - lesion[0]) < 0.5 * np.linalg.norm(places[0] - lesion[0])
+    assert np.linalg.norm(blind - places[0]) < 0.003

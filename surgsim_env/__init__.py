@@ -41,7 +41,7 @@ from surgsim_env.scene.load import (
 )
 from surgsim_env.scene.model import Port, Scene
 from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
-from surgsim_env.tasks.channels import CONTACT_FORCE, TIME_LEFT, TIP_POSITION, TIP_VELOCITY
+from surgsim_env.tasks.channels import CONTACT_FORCE, TAXELS, TIME_LEFT, TIP_POSITION, TIP_VELOCITY
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, Setup
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CONTACT_FORCE",
+    "TAXELS",
     "TIME_LEFT",
     "TIP_POSITION",
     "TIP_VELOCITY",

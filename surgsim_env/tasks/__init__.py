@@ -1,6 +1,6 @@
 """Tasks: they draw an episode, read the simulation and judge it; they never advance it."""
 
-from surgsim_env.tasks.channels import LENGTH_SCALE, TAXELS
+from surgsim_env.tasks.channels import LENGTH_SCALE
 from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, ControlStep, reward_weights
 from surgsim_env.tasks.layout import channel_slices
 from surgsim_env.tasks.palpate import DECLARE_STEPS, DECLARE_VALUE, EPISODE_STEPS, START_GAP, PalpateTask, touch_memory
@@ -19,7 +19,6 @@ __all__ = [
     "SPEED_FULL_SCALE",
     "START_GAP",
     "SUCCESS_ERROR",
-    "TAXELS",
     "WIDE",
     "ControlStep",
     "Disc",

@@ -97,6 +97,8 @@ class PalpateTask(Task):
     palpable face (`surgsim_env.palpation.chart`), row by row, the same size for every organ; farther apart where 16 tip
     radii do not span the face. `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
+    An instrument with taxels has three numbers more for each (`scenes/README.md`).
+
     With `frame="face"` ten numbers more, with `memory=True` 13: where the tip is on the organ's registered surface at
     rest, in tip radii and on the axes of its face (`surgsim_env.palpation.face_frame`), which commands are along too.
     A policy that reads these and the maps alone can play organs of any size and pose.

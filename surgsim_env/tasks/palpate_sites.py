@@ -68,7 +68,9 @@ class PalpateSitesTask(Task):
     of the chart, row by row along its second axis, the same size for every organ; sites are farther apart where 16 tip
     radii do not span the chart, as `map_cell` shows. With `memory=False` the last six numbers alone: a true POMDP, for
     agents with a memory of their own. All bounds finite.
-    `env.unwrapped.observation_slices` has the entries of each channel by its name.
+    `env.unwrapped.observation_slices` has the entries of each channel by its name. An instrument with taxels observes
+    their forces too, and the gradient of the contrast, from the shift of the centre of pressure; the estimator reads it
+    (docs/palpation.md).
 
     Contrast is stiffness (force over depth) over that of the scene's healthy organ of nominal modulus at this place, a
     map that is made once for each scene and kept on disk (`surgsim_env.palpation.chart`).

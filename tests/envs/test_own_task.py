@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_env import CONTACT_FORCE, TIP_POSITION, Channel, PalpateTask, Reward, Setup, Task, register_task
+from surgsim_env import CONTACT_FORCE, TAXELS, TIP_POSITION, Channel, PalpateTask, Reward, Setup, Task, register_task
 from surgsim_env.envs.ids import TASKS, environment_class
 from surgsim_env.scene.levels import LESION_GAP
 from surgsim_env.scripting import oracle_script, run_script
@@ -57,6 +57,25 @@ def registered():
     for id in made:
         gym.registry.pop(id, None)
         TASKS.pop(id, None)
+
+
+def test_an_own_task_feels_taxels(registered):
+    """Of an instrument that has them, through their sensor model; without them the channel is left out."""
+
+    class Feeling(Touch):
+        channels = (TIP_POSITION, TAXELS)
+
+    env_id = registered(Feeling)
+    assert gym.make(env_id).observation_space.shape == (3,)
+    env = gym.make(env_id, instrument="tactile_probe").unwrapped
+    env.reset(seed=0)
+    while not env.simulation.contact_force.any():
+        observation, *_ = env.step(np.array([0.0, 0.0, -1.0], dtype=np.float32))
+    felt = observation[env.observation_slices["taxels"]] * env.scene.limits.soft_force
+    true = env.simulation.taxels.ravel()
+    assert felt.shape == true.shape == (48,) and true.any()
+    noise = env.scene.instrument.taxels.noise
+    assert 0.0 < np.abs(felt - true).max() < 6.0 * noise
 
 
 # ---- one place ---------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Chart of a palpable face, a grid of sites across the approach, and the healthy organ's stiffness at the sites."""
 
 import contextlib
+import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -40,6 +41,8 @@ LANES = {np.float64: 8, np.float32: 16}
 MASS_SHARE = 0.025
 # Version of a map's contents.
 MAP_VERSION = 2
+# Division of a map's cells for taxels: within a cell of the grid the mesh moves the centre of pressure as lesions do.
+TAXEL_BETWEEN = 2
 # Environment variable with the cache's folder.
 FOLDER_VARIABLE = "SURGSIM_CACHE"
 
@@ -81,9 +84,14 @@ class Chart:
     @property
     def sites(self) -> FloatArray:
         """Places of all sites, shape (side_count**2, 2), in the order of their numbers."""
-        axis = np.linspace(-1.0, 1.0, self.side_count)
-        columns, rows = np.meshgrid(axis, axis)
-        return np.column_stack([columns.ravel(), rows.ravel()])
+        return _grid(self.side_count)
+
+
+def _grid(side_count: int) -> FloatArray:
+    """Places of a square grid over a chart, row by row along its second axis, (side_count**2, 2)."""
+    axis = np.linspace(-1.0, 1.0, side_count)
+    columns, rows = np.meshgrid(axis, axis)
+    return np.column_stack([columns.ravel(), rows.ravel()])
 
 
 def make_chart(face: PalpableFace, tip_radius: float) -> Chart:
@@ -213,9 +221,9 @@ class ChartedFace:
         best = int(np.argmin(distance))
         return Site(places[best], points[best], normals[best], float(distance[best]))
 
-    def grid_sites(self) -> list[Site]:
-        """Sites of the chart's grid, each moved to a pressable place."""
-        return [self.site(place) for place in self.chart.sites]
+    def grid_sites(self, between: int = 1) -> list[Site]:
+        """Sites of the chart's grid with its cells divided by `between`, each moved to a pressable place."""
+        return [self.site(place) for place in _grid(between * (self.chart.side_count - 1) + 1)]
 
     def _pressable(self, place: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Surface point [m] and normal at a place of the chart (2,), (3,) each; None if it is not pressable."""
@@ -358,20 +366,21 @@ def quickened(anatomy: Anatomy, progress: StepProgress) -> Anatomy:
 
 
 @lru_cache(maxsize=8)
-def healthy_map_of(anatomy: Anatomy) -> HealthyMap:
-    """`healthy_map` of a loaded anatomy with the scene's probe."""
+def healthy_map_of(anatomy: Anatomy, between: int = 1) -> HealthyMap:
+    """`healthy_map` of a loaded anatomy with the scene's probe, with the cells of its grid divided by `between`."""
     scene, digest = anatomy.scene, map_digest(anatomy)
     beside = healthy_file(scene.folder / f"{scene.name}.toml")
-    grid = _shipped(beside, digest)
+    grid = _shipped(beside, digest) if between == 1 else None
     if grid is not None:
         return HealthyMap(grid)
     # Like the members of its family: their maps start from this map.
     is_quick = scene.family is not None or beside.is_file()
-    path = cache_folder() / f"healthy-{digest}{'-quick' * is_quick}.npy"
+    path = cache_folder() / f"healthy-{digest}{'-quick' * is_quick}-{between}.npy"
     if path.is_file():
         return HealthyMap(np.load(path, allow_pickle=False))
     with StepProgress.on_stderr() as progress:
-        grid = _pressed(quickened(anatomy, progress), progress, np.float32) if is_quick else _pressed(anatomy, progress)
+        quick, dtype = (quickened(anatomy, progress), np.float32) if is_quick else (anatomy, np.float64)
+        grid = _pressed(quick, progress, dtype, between)
     keep_map(path, grid)
     return HealthyMap(grid)
 
@@ -384,19 +393,24 @@ def _shipped(path: Path, digest: str) -> FloatArray | None:
         return archive["grid"] if str(archive["digest"]) == digest else None
 
 
-def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type = np.float64) -> FloatArray:
+def _pressed(anatomy: Anatomy, progress: StepProgress, dtype: type, between: int = 1) -> FloatArray:
     """Press the healthy organ at each site of the chart's grid; `HealthyMap.grid`, shape (m, m, 3).
 
     A coarser grid would alias the mesh, with 3 % changes of force within a cell, into a slope of the organ.
     """
     charted = charted_face(anatomy)
-    grid = charted.grid_sites()
+    grid = charted.grid_sites(between)
     # Unpressable places are moved to others of the grid.
     sites = {site.place.tobytes(): site for site in grid}
     presses = press_sites(anatomy, list(sites.values()), progress, dtype)
     values = dict(zip(sites, presses, strict=True))
-    side = charted.chart.side_count
-    return np.array([values[site.place.tobytes()] for site in grid]).reshape(side, side, 3)
+    return as_map(np.array([values[site.place.tobytes()] for site in grid]))
+
+
+def as_map(rows: FloatArray) -> FloatArray:
+    """Values of all sites of a square grid (m m, k) as a map (m, m, k)."""
+    side = math.isqrt(len(rows))
+    return rows.reshape(side, side, -1)
 
 
 def press_sites(

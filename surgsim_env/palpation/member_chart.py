@@ -16,6 +16,7 @@ from surgsim_env.palpation.chart import (
     ChartedFace,
     HealthyMap,
     Site,
+    as_map,
     cache_folder,
     charted_face,
     healthy_map_of,
@@ -49,31 +50,34 @@ def still_template(scene: Scene) -> Anatomy:
 
 
 @lru_cache(maxsize=MAPS_MOST)
-def member_map(template: Anatomy, name: MemberName) -> HealthyMap:
+def member_map(template: Anatomy, name: MemberName, between: int = 1) -> HealthyMap:
     """Healthy map of a member of a family, from the cache on disk (`chart.healthy_map`) or by presses.
 
     Args:
         template: `still_template` of the family's scene.
         name: of the member.
+        between: division of the grid's cells.
 
     Raises:
         ValueError: as in `healthy_map`.
     """
     member = make_member(template, name)
-    path = cache_folder() / f"healthy-{content_digest(map_digest(template), map_digest(member))}.npy"
+    path = cache_folder() / f"healthy-{content_digest(map_digest(template), map_digest(member))}-{between}.npy"
     if path.is_file():
         return HealthyMap(np.load(path, allow_pickle=False))
-    base = healthy_map_of(template)
+    base = healthy_map_of(template, between)
     with StepProgress.on_stderr() as progress:
-        grid = _corrected(base, member, template, progress)
+        grid = _corrected(base, member, template, progress, between)
     keep_map(path, grid)
     return HealthyMap(grid)
 
 
-def _corrected(base: HealthyMap, member: Anatomy, template: Anatomy, progress: StepProgress) -> FloatArray:
+def _corrected(
+    base: HealthyMap, member: Anatomy, template: Anatomy, progress: StepProgress, between: int
+) -> FloatArray:
     """`HealthyMap.grid` of a member: the template's, corrected by presses on the member, (m, m, 3)."""
     charted, own = charted_face(member), charted_face(template)
-    sites = charted.grid_sites()
+    sites = charted.grid_sites(between)
     places = np.array([own.chart.place(member.face.carried(site.point, template.face)) for site in sites])
     inside = np.clip(places, -1.0, 1.0)
     expected, centre = base.stiffness(inside), base.centre(inside)
@@ -89,8 +93,7 @@ def _corrected(base: HealthyMap, member: Anatomy, template: Anatomy, progress: S
         differences - mean,
     )
     added = mean + matmul(_covariance(points, points[spread]), weights)
-    side = charted.chart.side_count
-    return np.column_stack([expected * exp(added[:, 0]), centre + added[:, 1:]]).reshape(side, side, 3)
+    return as_map(np.column_stack([expected * exp(added[:, 0]), centre + added[:, 1:]]))
 
 
 def _covariance(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -10,8 +10,14 @@ from msdm_core.arithmetic import exp, matmul
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.sensors import ForceReading, TaxelReading
 from surgsim_env.instruments.instrument import Instrument
-from surgsim_env.palpation.chart import MAP_SIDE, Site, charted_face, healthy_map_of
-from surgsim_env.palpation.lesion_estimator import ORGAN_MAP_SPREAD, LesionEstimate, LesionEstimator
+from surgsim_env.palpation.chart import MAP_SIDE, TAXEL_BETWEEN, Site, charted_face, healthy_map_of
+from surgsim_env.palpation.lesion_estimator import (
+    ORGAN_GRADIENT_SPREAD,
+    ORGAN_MAP_SPREAD,
+    REFERENCE_LESION_RADIUS,
+    LesionEstimate,
+    LesionEstimator,
+)
 from surgsim_env.palpation.member_chart import member_map, still_template
 from surgsim_env.palpation.scores import FOUND_SHARE, ospa, ospa_cutoff
 from surgsim_env.palpation.site_press import PressResult
@@ -284,7 +290,11 @@ class PalpateSitesTask(Task):
         anatomy, scene = self.anatomy, self.anatomy.scene
         self.charted = charted_face(anatomy)
         chart = self.charted.chart
-        healthy = healthy_map_of(self._still) if anatomy.member is None else member_map(self._still, anatomy.member)
+        between = 1 if self._patches is None else TAXEL_BETWEEN
+        if anatomy.member is None:
+            healthy = healthy_map_of(self._still, between)
+        else:
+            healthy = member_map(self._still, anatomy.member, between)
         wide = chart.extent.max() > WIDE * scene.instrument.tip_radius
         self.budget = self.given_budget if self.given_budget is not None else (BUDGET_WIDE if wide else BUDGET)
         self.felt = SiteTouches(self.charted, healthy, scene.palpation)
@@ -300,16 +310,19 @@ class PalpateSitesTask(Task):
         self._believe()
 
     def _gradient_noise(self, force: float) -> float:
-        """Standard deviation of a gradient by the taxels' noise under a force [N] [1/m]; 0 without taxels.
+        """Standard deviation of a gradient by taxels under a force [N], and by the map [1/m]; 0 without taxels.
 
-        The centre of pressure sum N_i x_i / sum N_i has s sqrt(sum x_i^2) / F.
+        By the taxels' noise s the centre of pressure sum N_i x_i / sum N_i has s sqrt(sum x_i^2) / F.
         """
         if self._patches is None:
             return 0.0
         places = self._patches.places
         away = self.charted.chart.along_axes(places - places.mean(axis=(0, 1, 2)))
         width = math.sqrt(0.5 * float((away * away).sum()))
-        return self._patches.taxels.noise * width / force / self.felt.gradient_gain
+        by_taxels = self._patches.taxels.noise * width / force / self.felt.gradient_gain
+        scene = self.anatomy.scene
+        by_map = ORGAN_GRADIENT_SPREAD * REFERENCE_LESION_RADIUS / felt_lesion_radius(scene)
+        return math.hypot(by_taxels, 0.0 if scene.mesh.block is not None else by_map)
 
     # ---- the episode ------------------------------------------------------------------------------------------------
 

@@ -58,8 +58,6 @@ BOOTSTRAP_SEED = 0
 PLACES = {"scene": "phantom", "level": "standard"}
 # Arguments of SurgSim/Palpate-v0 for observations independent of an organ's size and pose.
 IN_FACE = {"memory": True, "frame": "face"}
-# Printed figures of what the tissue bears.
-HARM = ("force_peak", "pressure_peak", "strain_peak", "torn")
 # Default split of a family of organs.
 SCORED_SPLIT = "test"
 
@@ -352,7 +350,10 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     )
     path = _write(result, player, options)
     values = {name: figure.value for name, figure in result.figures.items()}
-    printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", *HARM)
+    printed = (
+        *("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds"),
+        *("force_peak", "pressure_peak", "strain_peak", "torn"),
+    )
     figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
     where = "not written (--results FOLDER does)" if path is None else f"-> {path}"
     _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")

@@ -19,6 +19,10 @@ LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
 
 # Columns: heading, figure, decimals, factor.
 Column = tuple[str, str, int, float]
+LOAD: tuple[Column, ...] = (
+    ("peak tissue pressure [kPa]", "pressure_peak", 1, 0.001),
+    ("peak tissue strain", "strain_peak", 2, 1.0),
+)
 PLACES: tuple[Column, ...] = (
     ("presses to 5 mm, median", "presses_to_median", 0, 1.0),
     ("90th percentile", "presses_to_p90", 0, 1.0),
@@ -38,6 +42,7 @@ MAPS: tuple[Column, ...] = (
     ("force mean [N]", "force_mean", 2, 1.0),
     ("p95 [N]", "force_p95", 2, 1.0),
     ("peak [N]", "force_peak", 2, 1.0),
+    *LOAD,
     ("presses over soft limit [%]", "soft_force_share", 1, 100.0),
     ("impulse [N s]", "impulse", 2, 1.0),
     ("time [s]", "seconds", 0, 1.0),
@@ -49,6 +54,7 @@ TASKS: tuple[Column, ...] = (
     ("time to success [s]", "seconds", 1, 1.0),
     ("error [mm]", "error_mm", 1, 1.0),
     ("peak force [N]", "force_peak", 2, 1.0),
+    *LOAD,
     ("under soft limit [%]", "under_soft_force", 0, 100.0),
     ("torn [%]", "torn", 0, 100.0),
     ("peak grip [N]", "grip_force_peak", 2, 1.0),

@@ -219,15 +219,11 @@ class TissueLoad(NamedTuple):
 def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> TissueLoad:
     """Largest contact pressure, principal strain and equivalent strain of an organ.
 
-    p_i = sum of w A k_p g over the quadrature points around node i (`contact_energy`), over a third of the area of its
-    triangles; F_i = sum V_t F_t / sum V_t over its tets, with the singular values lambda: averages over a cell.
+    Pressures are those of `node_pressures`; F_i = sum V_t F_t / sum V_t over the tets of node i, with the singular
+    values lambda, is likewise an average over a cell.
     """
-    push = np.zeros(len(model.node_mass))
-    add_pressures(model, state, shapes, contact.stiffness, push)
-    third = np.repeat(model.surface_rest_area / 3.0, 3)
-    area = np.bincount(model.surface_triangles.ravel(), third, len(push))
-    pressure = np.divide(push, area, out=np.zeros_like(push), where=area > 0.0)
-    gradient = np.zeros((len(push), 3, 3))
+    pressure = node_pressures(model, state, shapes, contact)
+    gradient = np.zeros((len(pressure), 3, 3))
     add_gradients(model.node_rest_position, state.node_position, model.tet_nodes, gradient)
     gradient /= 4.0 * model.node_rest_volume[:, None, None]
     squared = matmul(gradient.transpose(0, 2, 1), gradient)
@@ -238,6 +234,19 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
         equivalent = float(node_strain[model.node_excess > 0.0].max())
     place, most = int(pressure.argmax()), int(strain.argmax())
     return TissueLoad(float(pressure[place]), place, float(strain[most]), most, equivalent)
+
+
+def node_pressures(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> FloatArray:
+    """Contact pressure at each node, per undeformed area [Pa], (n_node,); 0 inside the organ.
+
+    p_i = sum of w A k_p g over the quadrature points around node i (`contact_energy`), over a third of the area of its
+    triangles: an average over a cell.
+    """
+    push = np.zeros(len(model.node_mass))
+    add_pressures(model, state, shapes, contact.stiffness, push)
+    third = np.repeat(model.surface_rest_area / 3.0, 3)
+    area = np.bincount(model.surface_triangles.ravel(), third, len(push))
+    return np.divide(push, area, out=np.zeros_like(push), where=area > 0.0)
 
 
 def principal_values(matrices: FloatArray) -> FloatArray:

@@ -134,12 +134,10 @@ def _settings(palpation: PalpationResult) -> Rows:
     tip, depth, material = scene.instrument.tip_radius, scene.palpation.press_depth, scene.material
     forces = np.array([press.force for press in presses])[palpation.used]
     towards = ", ".join(f"{value:.3g}" for value in scene.instrument.approach)
-    strain, pressure = (max(getattr(press.load, name) for press in presses) for name in ("strain", "pressure"))
     return [
         ("press", f"ball of {tip * 1e3:g} mm radius, {depth * 1e3:g} mm deep, towards {towards}"),
         ("sites", f"{len(presses)}, {scene.palpation.site_spacing * 1e3:g} mm apart"),
         ("force held at the end", f"{forces.min():.3f} to {forces.max():.3f} N, median {np.median(forces):.3f} N"),
-        ("largest strain and pressure", f"{strain:.2f}, {pressure / 1e3:.1f} kPa"),
         ("contrast over 1 that contact hides", f"about {palpation.hidden_share:.1%} at the largest force"),
         ("hold", "no complete press" if palpation.hold is None else palpation.hold.text),
         ("organ", f"{mesh.node_count} nodes, {mesh.tet_count} tets, healthy tissue of {material.youngs_modulus:g} Pa"),
@@ -153,11 +151,14 @@ def _settings(palpation: PalpationResult) -> Rows:
 
 
 def _counts(palpation: PalpationResult) -> str:
-    """Numbers of sites pressed and left out, and the peak force, in a sentence."""
+    """Numbers of sites pressed and left out, and largest force, pressure and strain, in a sentence."""
+    loads = [press.load for press in palpation.presses]
     return (
         f"{len(palpation.presses)} sites pressed, {int((~palpation.used).sum())} ended early and left out, "
         f"{palpation.support_count} not pressed near supports; "
-        f"peak force {max(press.force_peak for press in palpation.presses):.2f} N"
+        f"peak force {max(press.force_peak for press in palpation.presses):.2f} N, at the end of presses contact "
+        f"pressure up to {max(load.pressure for load in loads) / 1e3:.1f} kPa, strain up to "
+        f"{max(load.strain for load in loads):.2f}"
     )
 
 

@@ -46,8 +46,9 @@ class EpisodeActor(Protocol):
 def make_envs(
     env_id: str, count: int, *, dtype: str = "float32", threads: int = 1, **kwargs: Any
 ) -> gym.vector.VectorEnv:
-    """Vectorised environments for `play`, without automatic resets."""
+    """Vectorised environments for `play`, without automatic resets, which measure the tissue's load."""
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "dtype": dtype}
+    kwargs["measure_tissue"] = True
     return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
 
 
@@ -222,19 +223,26 @@ class AgentActor:
 
 @dataclass
 class TaskRecord:
-    """One episode: length in steps, return, largest force of each step [N] and last info."""
+    """One episode: length in steps, return, largest force [N] and tissue load (Pa, strain) of each step, last info."""
 
     steps: int = 0
     total: float = 0.0
     force_peaks: list[float] = field(default_factory=list)
+    loads: list[tuple[float, float]] = field(default_factory=list)
     last: dict[str, Any] = field(default_factory=dict)
 
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a step."""
         self.steps, self.total = self.steps + 1, self.total + reward
         self.force_peaks.append(float(info["force_peak"]))
+        self.loads.append(tissue_load_of(info))
         if over:
             self.last = info
+
+
+def tissue_load_of(info: dict[str, Any]) -> tuple[float, float]:
+    """Largest pressure [Pa] and strain of the tissue in the info of a step, of an environment that measures them."""
+    return float(info["tissue_pressure"]), float(info["tissue_strain"])
 
 
 def play_tasks(
@@ -253,7 +261,7 @@ def play_scripts(
     """Episodes of the oracle's script, one after the other; a failed script ends its episode without success.
 
     Args:
-        env: one environment.
+        env: one environment, which measures the tissue's load.
         seeds: of the episodes.
         tracks: True to follow a moving surface.
         progress: called with 1 after each episode.
@@ -265,8 +273,8 @@ def play_scripts(
             trace = run_script(env, oracle_script(env, tracks=tracks))
         except ScriptError as failed:
             trace = failed.trace
-        peaks = [float(info["force_peak"]) for info in trace.infos]
-        records.append(TaskRecord(len(trace.reward), float(trace.reward.sum()), peaks, trace.infos[-1]))
+        peaks, loads = [float(info["force_peak"]) for info in trace.infos], [*map(tissue_load_of, trace.infos)]
+        records.append(TaskRecord(len(trace.reward), float(trace.reward.sum()), peaks, loads, trace.infos[-1]))
         progress(1)
     return records
 
@@ -283,6 +291,7 @@ def task_figures(
         rng: for the bootstrap.
     """
     succeeded = [bool(record.last["success"]) for record in records]
+    loads = np.array([np.max(record.loads, axis=0) for record in records])
     columns = {
         "success": succeeded,
         # Of successful episodes; the others take the time limit.
@@ -291,6 +300,8 @@ def task_figures(
         ],
         "return": [record.total for record in records],
         "force_peak": [max(record.force_peaks) for record in records],
+        "pressure_peak": loads[:, 0],
+        "strain_peak": loads[:, 1],
         "under_soft_force": [max(record.force_peaks) <= soft_force for record in records],
         "hard_limit_share": [bool(record.last["hard_limit"]) for record in records],
         "fault_share": [bool(record.last["sim_fault"]) for record in records],
@@ -344,24 +355,27 @@ class SiteRecord:
     def __init__(self, task: PalpateSitesTask, reference: Any) -> None:
         self.task, self.reference = task, reference
         self.estimates: list[NDArray[np.float64]] = []
-        self.forces: list[tuple[float, float, float]] = []
+        self.presses: list[tuple[float, ...]] = []
 
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a press; the last one completes the record."""
         self.estimates.append(np.array(self.task.estimated if self.reference is None else self._own_places()))
-        self.forces.append((float(info["force"]), float(info["force_peak"]), float(info["depth"])))
+        felt = (float(info["force"]), float(info["force_peak"]), float(info["depth"]))
+        self.presses.append((*felt, *tissue_load_of(info)))
         if over:
             self._complete(info)
 
     def _complete(self, info: dict[str, Any]) -> None:
         score = map_score(self.task)
-        force, peak, depth = np.array(self.forces).T
+        force, peak, depth, pressure, strain = np.array(self.presses).T
         self.record = PalpationRecord(
             truth=self.task.truth.copy(),
             estimates=self.estimates,
             cutoff=self.task.cutoff,
             force=force,
             force_peak=peak,
+            pressure=pressure,
+            strain=strain,
             # A linear ramp on the way in, then the hold.
             impulse=float((force * (HOLD_TIME + 0.5 * np.maximum(depth, 0.0) / PRESS_SPEED)).sum()),
             seconds=float(info["seconds"]),

@@ -332,7 +332,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         elif actor is not None:
             succeeded, scored = _task_scores(play_tasks(actor, envs, seeds, ended), first, rng)
         else:
-            single = gym.make(env_id, **kwargs)
+            single = gym.make(env_id, measure_tissue=True, **kwargs)
             records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=ended)
             succeeded, scored = _task_scores(records, first, rng)
     wall_time = time.perf_counter() - start
@@ -353,7 +353,10 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     )
     path = _write(result, player, options)
     values = {name: figure.value for name, figure in result.figures.items()}
-    printed = ("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds", "force_peak", "torn")
+    printed = (
+        *("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds"),
+        *("force_peak", "pressure_peak", "strain_peak", "torn"),
+    )
     figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
     where = "not written (--results FOLDER does)" if path is None else f"-> {path}"
     _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")

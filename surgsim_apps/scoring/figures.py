@@ -46,6 +46,7 @@ class PalpationRecord:
         estimates: estimated places on the surface after each press [m]                                 n x (k, 3)
         cutoff: of OSPA [m]
         force, force_peak: of each press, held and largest [N]                                          (n,)
+        pressure, strain: largest of the tissue at the end of each press [Pa], (1)                      (n,)
         impulse: integral of the contact force over all presses [N s]
         seconds: simulated and counted time [s]
         path_length: of the tip [m]
@@ -60,6 +61,8 @@ class PalpationRecord:
     cutoff: float
     force: FloatArray
     force_peak: FloatArray
+    pressure: FloatArray
+    strain: FloatArray
     impulse: float
     seconds: float
     path_length: float
@@ -201,6 +204,8 @@ EPISODE_FIGURES: Mapping[str, Callable[[PalpationRecord], float]] = {
     "force_mean": lambda record: float(record.force.mean()),
     "force_p95": lambda record: float(np.percentile(record.force_peak, 95.0)),
     "force_peak": lambda record: float(record.force_peak.max()),
+    "pressure_peak": lambda record: float(record.pressure.max()),
+    "strain_peak": lambda record: float(record.strain.max()),
     "soft_force_share": lambda record: float((record.force_peak > record.soft_force).mean()),
     "impulse": lambda record: record.impulse,
     "seconds": lambda record: record.seconds,

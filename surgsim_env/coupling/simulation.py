@@ -16,7 +16,7 @@ from msdm_core.kernels.structure_kernels import FAULT_INVERTED_TET, KEPT_NAMES, 
 from msdm_core.mesh.tet_mesh import FloatArray
 from msdm_core.organ.compile import relax_arms, rest_state
 from msdm_core.organ.fields import ContactPoints, TissueFields, contact_points, tissue_fields
-from msdm_core.organ.measure import TissueLoad, inverted_tets, tissue_load
+from msdm_core.organ.measure import TissueLoad, inverted_tets, node_pressures, tissue_load
 from msdm_core.organ.motion import SIGNAL, place_on_ground
 from msdm_core.organ.stability import stable_dt
 from msdm_core.organ.state import blank_state
@@ -115,6 +115,8 @@ class Simulation:
         force_peak: largest total force of the tissue in the last control step [N]
         pull_peak: largest pull of a jaw in it, the size of the sum of its fingers' forces [N]
         fault: what ended the last steps, or ""
+        node_dose: integral of contact pressure over time at each node since the reset [Pa s], (n_node,), where the
+            scene limits the dose: a control step adds its duration times the pressure at its end
     """
 
     def __init__(self, anatomy: Anatomy) -> None:
@@ -183,6 +185,11 @@ class Simulation:
         shapes = self.instrument.shapes
         return contact_points(self.organ_model, self.organ_state, shapes, self.contact, self.substep_dt)
 
+    @property
+    def tissue_dose(self) -> float:
+        """Largest of `node_dose` [Pa s]."""
+        return float(self.node_dose.max())
+
     def fields(self) -> TissueFields:
         """Contact traction, stress, stretch and energy of the organ as it is now, with the contact of the next substep.
 
@@ -241,10 +248,11 @@ class Simulation:
         # The organ at rest, as scanned or settled under gravity, and its sticking friction on supports.
         self._rest_position = self.organ_state.node_position.copy()
         self._rest_stretch = self.organ_state.support_stretch.copy()
+        self.node_dose = np.zeros(len(organ_model.node_mass))
         self.restart(tip_position, elapsed=elapsed)
 
     def restart(self, tip_position: FloatArray, *, elapsed: float = 0.0) -> None:
-        """Return the same organ to rest, place the tip at a position [m], and reset the clock.
+        """Return the same organ to rest, place the tip at a position [m], and reset the clock; the dose stays.
 
         The motions begin again as they were drawn; a breath that is held stays so.
 
@@ -263,6 +271,8 @@ class Simulation:
         state.contact_passed[:] = 0
         state.motion[:] = 0.0
         self._step, self._motion_start = 0, round(elapsed / self.haptic_dt)
+        # The haptic steps that the dose has.
+        self._dosed_step = 0
         self._begin_course()
         self._rest_on_ground()
         self._place_supports()
@@ -415,7 +425,7 @@ class Simulation:
         place_on_ground(self.organ_model, self.organ_state, now, (soon - now) / self.haptic_dt)
 
     def end_control_step(self) -> bool:
-        """Update the instrument's poses; False, with `fault` saying why, at an inverted tet or a warning of MuJoCo.
+        """Update the instrument's poses and the dose; False, with `fault` saying why, at an inverted tet or a warning.
 
         A substep checks the tets as they are at its start: those that the last one leaves are checked here.
         """
@@ -424,7 +434,15 @@ class Simulation:
             self.fault = describe_fault(self.organ_model, self.organ_state, FAULT_INVERTED_TET)
         else:
             self.fault = self.instrument.warning()
+        if self._measures_dose and not self.fault:
+            pressure = node_pressures(self.organ_model, self.organ_state, self.instrument.shapes, self.contact)
+            self.node_dose += (self._step - self._dosed_step) * self.haptic_dt * pressure
+            self._dosed_step = self._step
         return not self.fault
+
+    @property
+    def _measures_dose(self) -> bool:
+        return self.anatomy.scene.limits.dose is not None
 
     def get_state(self) -> dict[str, np.ndarray]:
         """All changing quantities, as arrays by name; the caller keeps the organ's model."""
@@ -436,6 +454,7 @@ class Simulation:
         return {
             **arrays,
             **(motion if self.anatomy.scene.motions else {}),
+            **({"node_dose": self.node_dose.copy()} if self._measures_dose else {}),
             "instrument": self.instrument.get_state(),
             "rest_position": self._rest_position.copy(),
             "rest_stretch": self._rest_stretch.copy(),
@@ -459,6 +478,8 @@ class Simulation:
         # Scratch arrays have the size of this organ.
         blank = blank_state(organ_model, shape_count=len(self.instrument.shapes.shape_radius))
         like = self.get_state() | {f"organ_{name}": getattr(blank, name) for name in self._kept_fields}
+        if self._measures_dose:
+            like["node_dose"] = organ_model.node_mass
         check_entries(arrays, {**like, "rest_position": blank.node_position, "rest_stretch": blank.support_stretch})
         self.organ_model = organ_model
         self.organ_state = blank._replace(**{name: arrays[f"organ_{name}"].copy() for name in self._kept_fields})
@@ -476,7 +497,9 @@ class Simulation:
         self._wrench[:] = arrays["wrench"]
         self.instrument.shapes.taxel_force[:] = arrays["taxel_force"]
         self.pull_peak = float(arrays["pull_peak"])
-        self._step = int(arrays["step"])
+        self._step = self._dosed_step = int(arrays["step"])
+        if self._measures_dose:
+            self.node_dose = arrays["node_dose"].copy()
         self.fault = str(arrays["fault"])
 
     @property

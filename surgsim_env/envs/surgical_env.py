@@ -52,6 +52,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             "rgb_force" a dictionary of the "picture" and, as "force", the channels that depend on force sensing.
         observe_force: False observes all channels that depend on force sensing as 0.
         looks: "train" or "test" draws a look of all pictures for each episode (`take_looks`), None takes the scene's.
+        measure_tissue: True measures the tissue's load in each step also where the scene has no limits of it.
         render_mode: None, "rgb_array" or "human".
         settings: the task's own arguments, and fields of `RenderOptions`.
 
@@ -78,6 +79,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         scaled: bool = True,
         observe_force: bool = True,
         looks: str | None = None,
+        measure_tissue: bool = False,
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
@@ -85,6 +87,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         kind = self.task_class
         own = {name: settings.pop(name) for name in setting_names(kind) & set(settings)}
         simulation, self.runtime = make_runtime(kind, scene and str(scene), instrument and str(instrument), **own)
+        self.runtime.measures_tissue |= measure_tissue
         self.scene, self._mesh = simulation.anatomy.scene, simulation.anatomy.mesh
         self.simulation = simulation
         self._view = EpisodeView(self.simulation, render_mode, settings)

@@ -458,7 +458,9 @@ def map_digest(anatomy: Anatomy) -> str:
     """Hash of a map's inputs: the scene without its lesions, the instrument's file, the physics' version."""
     scene = anatomy.scene
     parts = (
-        *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing, scene.limits),
+        *(scene.material, scene.capsule, scene.damping, scene.contact, scene.instrument, scene.timing),
+        # The limits of a press.
+        *(scene.limits.soft_force, scene.limits.hard_force),
         *(scene.palpation, scene.stiffness_rule, scene.gravity, scene.supports),
         tuple(region for region in scene.regions if not region.lesion),
         tuple(anchor for anchor in scene.anchors if anchor.is_elastic),

@@ -390,9 +390,9 @@ class Timing:
 class Limits:
     """Force limits [N]: more than soft_force costs reward, more than hard_force ends an episode, as does tearing.
 
-    A jaw's pull above tear_force tears the tissue; by default nothing tears. Contact pressure [Pa] or principal strain
-    (1) of the tissue beyond pressure or strain damages it and also ends an episode; inf measures them only, and None,
-    the default, does not measure them.
+    A jaw's pull above tear_force tears the tissue; by default nothing tears. Contact pressure [Pa], principal strain
+    (1) or dose of the tissue, the integral of contact pressure over time at a place [Pa s], beyond pressure, strain or
+    dose damages it and also ends an episode; inf measures them only, and None, the default, does not measure them.
     """
 
     soft_force: float
@@ -400,6 +400,7 @@ class Limits:
     tear_force: float = math.inf
     pressure: float | None = None
     strain: float | None = None
+    dose: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.soft_force < self.hard_force:
@@ -408,7 +409,8 @@ class Limits:
             )
         if not self.tear_force > 0.0:
             raise ValueError(f"limits.tear_force is {self.tear_force:g} N; it must be above 0")
-        for name, value, unit in (("pressure", self.pressure, " Pa"), ("strain", self.strain, "")):
+        for name, unit in (("pressure", " Pa"), ("strain", ""), ("dose", " Pa s")):
+            value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(
                     f"limits.{name} is {value:g}{unit}; it must be above 0, inf to measure it only, or left out"
@@ -417,7 +419,7 @@ class Limits:
     @property
     def judges_tissue(self) -> bool:
         """True if the largest pressure and strain of the tissue are measured in each control step."""
-        return self.pressure is not None or self.strain is not None
+        return any(limit is not None for limit in (self.pressure, self.strain, self.dose))
 
     def excess(self, force: float) -> float:
         """Force [N] on a scale from the soft limit (0) to the hard limit (1), not clipped."""

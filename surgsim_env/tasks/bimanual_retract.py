@@ -68,9 +68,11 @@ class BimanualRetractTask(RetractTask):
     ## Info
     That of `SurgSim/Retract-v0`, and `collided`, `touches` (bool), `uncovered` (share), `touch_force`,
     `collision_force` [N].
-    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
-    `damaged` (bool): more than a limit is a safety stop.
+    Where the scene has `[limits] pressure`, `strain` or `dose`, and with `measure_tissue`, also `tissue_pressure` [Pa]
+    and `tissue_strain`, the largest of the tissue at the end of the step, `tissue_extrapolated` (bool): strain beyond
+    `strain_supported` of the material's stiffening, and `damaged` (bool): more than a limit is a safety stop. With
+    `dose` also `tissue_dose` [Pa s], the largest integral of pressure over time at a place of the surface so far: a
+    step adds its duration times the pressure at its end.
 
     ## Arguments
     Those of `SurgSim/Retract-v0`; `instrument` is "psm_pair", or two arms (names or TOML files) as "LEFT+RIGHT":

@@ -317,6 +317,7 @@ COMMON_ARGUMENTS = """* `scaled`: each value over its channel's scale, of order 
 * `obs_mode`: "state" (default), "rgb" for the endoscope's picture, `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL), or
   "rgb_force" for a dictionary of it ("picture") and of the channels that depend on force sensing ("force").
 * `looks`: None (default), or "train" or "test" for pictures with a random look in each episode (docs/rendering.md).
+* `measure_tissue`: True measures the tissue's load in each step (`info`) also where the scene has no limits of it.
 * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
 * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
   `surgsim_env.rendering.options.RenderOptions`: what pictures show."""

@@ -128,9 +128,11 @@ class PalpateTask(Task):
     declared), `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes
     through none), `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
-    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
-    `damaged` (bool): more than a limit is a safety stop.
+    Where the scene has `[limits] pressure`, `strain` or `dose`, and with `measure_tissue`, also `tissue_pressure` [Pa]
+    and `tissue_strain`, the largest of the tissue at the end of the step, `tissue_extrapolated` (bool): strain beyond
+    `strain_supported` of the material's stiffening, and `damaged` (bool): more than a limit is a safety stop. With
+    `dose` also `tissue_dose` [Pa s], the largest integral of pressure over time at a place of the surface so far: a
+    step adds its duration times the pressure at its end.
 
     ## Arguments
     * `scene`: a scene's name (`surgsim_env.list_scenes()`) or the path of a scene file; default "phantom".

@@ -104,9 +104,12 @@ class PalpateSitesTask(Task):
     (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none),
     `lesion_count_estimated`, `success`, `is_success`.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
-    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
-    `damaged` (bool): more than a limit is a safety stop.
+    Where the scene has `[limits] pressure`, `strain` or `dose`, and with `measure_tissue`, also `tissue_pressure` [Pa]
+    and `tissue_strain`, the largest of the tissue at the end of the press, `tissue_extrapolated` (bool): strain beyond
+    `strain_supported` of the material's stiffening, and `damaged` (bool): more than a limit is a safety stop. With
+    `dose` also `tissue_dose` [Pa s], the largest integral of pressure over time at a place of the surface so far, over
+    all presses: each part of a press (a control step inward, 10 ms of the rest and on a moving organ) adds its duration
+    times the pressure at its end.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "phantom".

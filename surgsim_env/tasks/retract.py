@@ -168,9 +168,11 @@ class RetractTask(Task):
     slip, or were lost while the jaw was commanded to close), `path_length` of the tip [m], `strain_held`,
     `strain_middle`, `strain_free`: largest strain of an edge of the mesh in the lobe's thirds, from the held edge to
     the free one.
-    Where the scene has `[limits] pressure` or `strain` also `tissue_pressure` [Pa] and `tissue_strain`, the largest of
-    the tissue, `tissue_extrapolated` (bool): strain beyond `strain_supported` of the material's stiffening, and
-    `damaged` (bool): more than a limit is a safety stop.
+    Where the scene has `[limits] pressure`, `strain` or `dose`, and with `measure_tissue`, also `tissue_pressure` [Pa]
+    and `tissue_strain`, the largest of the tissue at the end of the step, `tissue_extrapolated` (bool): strain beyond
+    `strain_supported` of the material's stiffening, and `damaged` (bool): more than a limit is a safety stop. With
+    `dose` also `tissue_dose` [Pa s], the largest integral of pressure over time at a place of the surface so far: a
+    step adds its duration times the pressure at its end.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[retract]` table, or that names such a file, as

@@ -29,7 +29,7 @@ from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
 # Draws of an episode until the task has to accept one.
 DRAWS_MOST = 20
-# Name of the end by tissue above the limits of pressure or strain.
+# Name of the end by tissue above the limits of pressure, strain or dose.
 DAMAGE = "damage"
 # Ends that need no reward of their name: failures, a success, and an end that is neither.
 ENDS = ("fault", "hard_force", DAMAGE, "success", "done")
@@ -57,11 +57,13 @@ class TaskRuntime:
         family: members that episodes draw from; None for a scene of one organ
         sensors: sensor models, by the channel's name
         successes, failures: names of the ends that are these
+        measures_tissue: True if `info` has the tissue's load, as it has by itself where the scene limits it
     """
 
     def __init__(self, task: Task, family: OrganFamily | None = None) -> None:
         """Play the episodes of a task."""
         self.task, self.family = task, family
+        self.measures_tissue = task.limits.judges_tissue
         self.layout = TaskLayout(task)
         own = task.anatomy.scene.sensor
         taxels, shape = task.anatomy.scene.instrument.taxels, task.taxel_shape
@@ -186,8 +188,8 @@ class TaskRuntime:
                 f'{type(task).__name__}.end returned {end!r}; return "" while the episode goes on, else one of '
                 f"{', '.join(sorted(self._ends))}, or declare a reward of that name"
             )
-        load = step.simulation.tissue_load if task.limits.judges_tissue and not step.fault else None
-        if load is not None and end not in self.failures and self._damages(load):
+        load = step.simulation.tissue_load if self.measures_tissue and not step.fault else None
+        if load is not None and end not in self.failures and self._damages(load, step.simulation.tissue_dose):
             end = DAMAGE
         if not step.fault:
             self._reached = self._values(step)
@@ -205,7 +207,7 @@ class TaskRuntime:
 
     def _info(self, step: ControlStep | None, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
         """The task's entries of `info`, the tissue's, and the success by the names that trainers read."""
-        info = {"success": end in self.successes, **self.task.info(step, end), **self._tissue_info(load, end)}
+        info = {"success": end in self.successes, **self.task.info(step, end), **self._tissue_info(step, load, end)}
         return {**info, "is_success": bool(info["success"])}
 
     def _values(self, step: ControlStep) -> dict[str, float]:
@@ -248,25 +250,27 @@ class TaskRuntime:
                 return float(task.episode_steps - task.step_count)
         return self._value(reward, step)
 
-    def _damages(self, load: TissueLoad) -> bool:
-        """True if a load exceeds the scene's limits of pressure or strain."""
+    def _damages(self, load: TissueLoad, dose: float) -> bool:
+        """True if a load or a dose [Pa s] exceeds the scene's limits."""
         limits = self.task.limits
-        return load.pressure > (limits.pressure or math.inf) or load.strain > (limits.strain or math.inf)
+        measured = ((load.pressure, limits.pressure), (load.strain, limits.strain), (dose, limits.dose))
+        return any(value > (limit or math.inf) for value, limit in measured)
 
-    def _tissue_info(self, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
-        """Largest pressure [Pa] and strain of the tissue, for scenes with limits of these; 0 without a load.
+    def _tissue_info(self, step: ControlStep | None, load: TissueLoad | None, end: str) -> dict[str, InfoValue]:
+        """Largest pressure [Pa], strain and dose [Pa s] of the tissue, where measured; 0 without a load, or a step.
 
         It is extrapolated beyond the equivalent strain up to which recorded presses support the tissue's law.
         """
-        if not self.task.limits.judges_tissue:
+        if not self.measures_tissue:
             return {}
+        dose = 0.0 if step is None else step.simulation.tissue_dose
         pressure, strain, equivalent = (
             (0.0, 0.0, 0.0) if load is None else (load.pressure, load.strain, load.equivalent_strain)
         )
         extrapolated = equivalent > self.task.anatomy.scene.material.strain_supported
         return {
             "tissue_pressure": pressure, "tissue_strain": strain, "tissue_extrapolated": extrapolated,
-            "damaged": end == DAMAGE,
+            "damaged": end == DAMAGE, **({} if self.task.limits.dose is None else {"tissue_dose": dose}),
         }  # fmt: skip
 
     # ---- saved states ------------------------------------------------------------------------------------------

@@ -112,6 +112,12 @@ def test_a_baseline_is_played_and_scored(tmp_path: Path) -> None:
     assert (made.method, made.budget, made.seeds) == ("gp_ucb", 3, (1_000_000, 1_000_001))
     assert np.array(made.errors_mm).shape == (2, 3) and len(made.lesion_counts) == 2
     assert 0.1 < made.figures["force_mean"].value < 0.6
+    assert 1e3 < made.figures["pressure_peak"].value < 2e4 and 0.1 < made.figures["strain_peak"].value < 1.0
+    leaderboard.write_leaderboard(tmp_path, tmp_path / "board.md")
+    head, _, row = [line.split("|") for line in (tmp_path / "board.md").read_text().splitlines() if "|" in line][3:6]
+    shown = dict(zip(map(str.strip, head), map(str.strip, row), strict=True))
+    assert shown["peak tissue pressure [kPa]"].startswith(f"{made.figures['pressure_peak'].value / 1e3:.1f}")
+    assert shown["peak tissue strain"].startswith(f"{made.figures['strain_peak'].value:.2f}")
     assert made.figures["fault_share"].value == made.figures["hard_limit_share"].value == 0.0
     assert made.figures["seconds"].value > 3 * 0.25
     assert made.command.endswith("--agent gp_ucb --episodes 2 --budget 3")

@@ -29,6 +29,8 @@ def record(truth: np.ndarray, estimates: list[np.ndarray], made: MapScore | None
         cutoff=CUTOFF,
         force=np.full(len(estimates), 0.2),
         force_peak=np.linspace(0.2, 0.6, len(estimates)),
+        pressure=np.linspace(3e3, 1e3, len(estimates)),
+        strain=np.linspace(0.1, 0.3, len(estimates)),
         impulse=0.1,
         seconds=2.0,
         path_length=0.3,
@@ -129,6 +131,7 @@ def test_forces_are_those_of_the_presses() -> None:
     assert figures["force_mean"].value == pytest.approx(0.2)
     assert figures["force_peak"].value == pytest.approx(0.6)
     assert figures["force_p95"].value == pytest.approx(0.58)  # 0.2, 0.3 ... 0.6: the 95th percentile
+    assert figures["pressure_peak"].value == 3e3 and figures["strain_peak"].value == 0.3
     assert figures["soft_force_share"].value == pytest.approx(0.2)
     assert figures["hard_limit_share"].value == 1.0
 

@@ -17,9 +17,8 @@ ID = "SurgSim/Retract-v0"
 
 
 def envs(count: int, mode: str = "Disabled", **settings) -> gym.vector.VectorEnv:
-    return gym.make_vec(
-        ID, num_envs=count, vectorization_mode="vector_entry_point", autoreset_mode=mode, threads=1, **settings
-    )
+    lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": mode, "threads": 1}
+    return gym.make_vec(ID, num_envs=count, measure_tissue=True, **lanes, **settings)
 
 
 def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
@@ -29,18 +28,22 @@ def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
 
     seeds = [21, 22, 23]
     records = play_tasks(RetractExpert().act_all, envs(2), seeds)
-    single = gym.make(ID)
+    single = gym.make(ID, measure_tissue=True)
     for seed, record in zip(seeds, records, strict=True):
         observation, info = single.reset(seed=seed)
-        steps, total, over = 0, 0.0, False
+        steps, total, loads, over = 0, 0.0, [], False
         while not over:
             observation, reward, terminated, truncated, info = single.step(RetractExpert().act(observation))
             steps, total, over = steps + 1, total + float(reward), terminated or truncated
-        assert (steps, total) == (record.steps, record.total)
+            loads.append((info["tissue_pressure"], info["tissue_strain"]))
+        assert (steps, total, loads) == (record.steps, record.total, record.loads)
         assert {name: record.last[name] for name in info} == info
         assert record.last["success"] and not record.last["torn"] and record.last["visible"] >= 0.8
     figures = task_figures(records, 0.05, 1.0, np.random.default_rng(0))
     assert figures["success"].value == 1.0 and figures["torn"].value == figures["fault_share"].value == 0.0
+    pressures, strains = zip(*(np.max(record.loads, axis=0) for record in records), strict=True)
+    assert figures["pressure_peak"].value == pytest.approx(np.mean(pressures)) and min(pressures) > 1000.0
+    assert figures["strain_peak"].value == pytest.approx(np.mean(strains)) and min(strains) > 0.05
     pulls = [record.last["pull_force_peak"] for record in records]
     assert figures["pull_force_peak"].value == pytest.approx(np.mean(pulls))
 

@@ -48,7 +48,7 @@ def play(
         envs = make_envs(env_id, lanes, dtype="float64", **settings)
     else:
         arguments = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": "Disabled"}}
-        envs = gym.make_vec(env_id, 1, **arguments, **settings)
+        envs = gym.make_vec(env_id, 1, measure_tissue=True, **arguments, **settings)
     episodes = [(name, seed) for seed in seeds for name in strategies]
     players = iter([Player(strategies[name]) for name, _ in episodes])
     actor = AgentActor(lambda: next(players), facts=lambda env: env)

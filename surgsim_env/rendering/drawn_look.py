@@ -19,8 +19,10 @@ _RGB, _ROLES = int(mujoco.mjtTextureRole.mjTEXROLE_RGB), int(mujoco.mjtTextureRo
 class DrawnLook:
     """Current look of a drawn scene; None is the scene's own."""
 
-    def __init__(self, scene: SceneModel, context: mujoco.MjrContext, *, has_vessels: bool) -> None:
-        """Keep the scene's own colours and lights; without vessels tissue has one colour."""
+    def __init__(
+        self, scene: SceneModel, context: mujoco.MjrContext, *, has_vessels: bool, painted: bool
+    ) -> None:
+        """Keep the scene's own colours and lights; without vessels tissue has one colour, painted tissue keeps its."""
         self._scene, self._context = scene, context
         model, head = scene.model, scene.model.vis.headlight
         self._changed = [
@@ -32,7 +34,7 @@ class DrawnLook:
             )
         ]
         names = [model.material(index).name for index in range(model.nmat)]
-        self._tissue = [names.index(name) for name in TISSUE if name in names]
+        self._tissue = [names.index(name) for name in TISSUE if name in names and not painted]
         self._drape = [names.index(name) for name in ("drape",) if name in names]
         drawn = scene.instrument.target
         support = np.array([model.geom(index).name.startswith(SUPPORT_PREFIX) for index in drawn], dtype=np.bool_)

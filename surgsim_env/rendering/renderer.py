@@ -4,13 +4,14 @@ import contextlib
 import math
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
@@ -19,6 +20,7 @@ from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import RenderOptions, check_camera
+from surgsim_env.rendering.painted_fields import PAINTED_FIELDS, PaintedField, draw_bar
 from surgsim_env.rendering.scene_model import (
     add_instrument,
     add_lights,
@@ -82,6 +84,8 @@ class OrganRenderer:
         self._stage: Stage | None = None
         self._tissue: Tissue | None = None
         self._tissue_lesions: tuple[Lesion, ...] = ()
+        self._field = None if self.options.paint is None else PAINTED_FIELDS[self.options.paint]
+        self._scale_end: float | None = None
         self.follow_anatomy()
 
     def follow_anatomy(self) -> None:
@@ -108,6 +112,8 @@ class OrganRenderer:
             frame = stage.canvas.colour()
         if self.look is not None:
             frame = self.look.exposed(frame, self.moment)
+        if self._field is not None and self._scale_end is not None:
+            draw_bar(frame, self._field, self._scale_end)
         if self.options.show_force:
             draw_forces(frame, self._simulation, view)
         return frame
@@ -180,6 +186,8 @@ class OrganRenderer:
             self._tissue_lesions = shown
         nodes, tissue, scene = simulation.organ_state.node_position, self._tissue, stage.scene
         shapes = tissue.shapes(nodes)
+        if self._field is not None:
+            self._paint(shapes, self._field, tissue)
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             triangles = simulation.anatomy.mesh.boundary_triangles
@@ -187,6 +195,21 @@ class OrganRenderer:
             shapes["shadow"] = ground_shadow(nodes, triangles, light, scene.ground, up)
         lesions = tissue.lesion_ellipsoids(nodes) if options.show_lesion else []
         stage.show(camera, shapes, simulation.instrument.data, lesions, self.target, self.look)
+
+
+    def _paint(self, shapes: dict[str, Shape], field: PaintedField, tissue: Tissue) -> None:
+        """Give the shapes of tissue the colours of a field; a diverged organ has none, and its picture no bar."""
+        simulation, self._scale_end = self._simulation, None
+        try:
+            nodes = field.node_values(simulation.organ_model, simulation.fields())
+        except OrganDivergedError:
+            shares = {name: np.zeros(len(shapes[name].vertices)) for name in shapes}
+        else:
+            values = tissue.vertex_values(nodes)
+            self._scale_end = end = field.scale_end(np.concatenate(list(values.values())))
+            shares = {name: field.shares(value, end) for name, value in values.items()}
+        for name, share in shares.items():
+            shapes[name] = replace(shapes[name], face_places=shapes[name].faces, shares=share)
 
 
 def ground_shadow(

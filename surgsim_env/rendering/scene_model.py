@@ -1,7 +1,7 @@
 """Drawn scene as a MuJoCo model of its own, never simulated: organ, sections, instrument, drape, lights."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -13,6 +13,7 @@ from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_PREFIX
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.embedding import EmbeddedSurface
 from surgsim_env.rendering.options import RenderOptions
+from surgsim_env.rendering.painted_fields import field_colours
 from surgsim_env.rendering.surface import DrawnSurface, Shape
 from surgsim_env.rendering.tissue import SECTION_SPLITS, most_tets_cut
 from surgsim_env.rendering.vessels import TEXTURE_SIZE, texture_places
@@ -51,6 +52,10 @@ FINISHES = {
     "section_lesion": Finish((0.980, 0.860, 0.500), 0.10, 0.20, 0.25),
     "shadow": Finish((0.055, 0.150, 0.170), 0.0, 0.0),
 }
+# Of tissue under a painted field, whose colours are multiplied by it: the lights together then add up to 1.
+PAINTED_COLOUR = (0.78, 0.78, 0.78)
+# Meshes of tissue, on which fields are painted.
+TISSUE = ("organ", "held", "section", "section_lesion")
 LESION_COLOUR = (0.98, 0.84, 0.42)
 TARGET_COLOUR = (0.20, 0.75, 0.35)
 # Width of the drape's squares [m], a scale for the eye.
@@ -62,6 +67,8 @@ DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
 # Name of the texture of vessels, white until a look draws them.
 VESSELS = "vessels"
+# Name of the texture of a painted field, and its width [pixels]: the scale there and back, as textures repeat.
+FIELD, FIELD_WIDTH = "field", 512
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
 # MuJoCo accepts no empty or flat mesh: before the first picture a mesh consists of copies of this tetrahedron.
@@ -89,6 +96,11 @@ class DrawnMesh:
         first = model.mesh_faceadr[mesh]
         for array in (model.mesh_face, model.mesh_facenormal):
             array[first : first + len(shape.faces)] = shape.faces
+        if shape.shares is not None:
+            # Between the middles of the first and the last pixel of the way there.
+            pixels = 0.5 + (0.5 * FIELD_WIDTH - 1.0) * shape.shares
+            at = model.mesh_texcoordadr[mesh]
+            model.mesh_texcoord[at : at + count, 0] = pixels / FIELD_WIDTH
         if shape.face_places is not None:
             model.mesh_facetexcoord[first : first + len(shape.faces)] = shape.face_places
         self._face_count = len(shape.faces)
@@ -149,16 +161,28 @@ def build_scene(
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
+    painted = options.paint is not None
+    if painted:
+        there = field_colours(FIELD_WIDTH // 2)
+        field = spec.add_texture(name=FIELD, type=mujoco.mjtTexture.mjTEXTURE_2D, width=FIELD_WIDTH, height=1)
+        field.nchannel, field.data = 3, np.concatenate([there, there[::-1]]).tobytes()
     vessels = spec.add_texture(name=VESSELS, type=mujoco.mjtTexture.mjTEXTURE_2D, width=TEXTURE_SIZE)
     vessels.height, vessels.builtin = TEXTURE_SIZE, mujoco.mjtBuiltin.mjBUILTIN_FLAT
     vessels.rgb1 = vessels.rgb2 = [1.0, 1.0, 1.0]
     for name, (vertices, faces) in meshes.items():
         whole = name in ("organ", "held")
         opacity = TRANSLUCENT if options.show_lesion and whole else 1.0
-        add_tissue(spec, name, vertices, faces, opacity, places if whole else None)
+        if painted and name in TISSUE:
+            add_tissue(spec, name, vertices, faces, opacity, np.zeros((vertices, 2), dtype=np.float32), painted=True)
+        else:
+            add_tissue(spec, name, vertices, faces, opacity, places if whole else None)
     add_instrument(spec, instrument)
     model, data, drawn = compile_scene(spec, meshes)
-    return SceneModel(model, data, drawn, find_instrument(model, instrument), light, ground, anatomy.downward)
+    geoms = find_instrument(model, instrument)
+    if painted:
+        # The painted contact lies under the tip.
+        model.geom_rgba[geoms.target, 3] = TRANSLUCENT
+    return SceneModel(model, data, drawn, geoms, light, ground, anatomy.downward)
 
 
 def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4, far: float = FAR) -> mujoco.MjSpec:
@@ -183,15 +207,21 @@ def add_tissue(
     face_count: int,
     opacity: float = 1.0,
     texture_places: NDArray[np.float32] | None = None,
+    *,
+    painted: bool = False,
 ) -> None:
     """Add a mesh with the finish of its name, with space for `vertex_count` vertices and `face_count` triangles.
 
-    Texture places (n_place, 2) let its triangles be textured.
+    Texture places (n_place, 2) let its triangles be textured; with `painted` they are by the colours of a field.
     """
     finish = FINISHES[name]
+    if painted:
+        finish = replace(finish, colour=PAINTED_COLOUR)
     material = spec.add_material(name=name, specular=finish.specular, shininess=finish.shininess)
     material.rgba = [*finish.colour, opacity]
     material.emission = finish.emission
+    if painted:
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FIELD
     corner = np.resize(np.arange(4), max(vertex_count, 4))
     faces = np.resize(_TETRAHEDRON_FACES.ravel(), 3 * max(face_count, 4))
     mesh = spec.add_mesh(name=name)

@@ -8,22 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.kernels.structure_kernels import OrganModel
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from msdm_core.organ.fields import TissueFields
 
 # Perceptually uniform, and distinct for all kinds of colour blindness.
 COLOUR_MAP = "viridis"
-# A scale's length is one of these times a power of ten, so that it changes in few steps.
-STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-# Length and width of a picture's bar, its distance from the edges, and the size of its text, at a picture height of 480
-# [pixels].
-BAR_LENGTH, BAR_WIDTH, BAR_GAP, BAR_TEXT = 150.0, 10.0, 14.0, 14.0
-BAR_BACK, BAR_INK = (10, 14, 18), (235, 238, 240)
+# Share of a picture's height that the text beside the bar takes.
+TEXT_HEIGHT = 0.03
 
 
 @dataclass(frozen=True)
 class PaintedField:
-    """A field with a value at each node.
+    """A field with a value at each node, and the linear scale of its colours.
 
     Fields:
         title: in words
@@ -31,7 +27,7 @@ class PaintedField:
         shown: shown value over that in SI units
         lowest: start of the scale, the value of undeformed tissue [unit]
         least: smallest length of the scale; below, rounding errors would be painted [unit]
-        at_nodes: values at the nodes, (n_node,), in SI units
+        at_nodes: values at the nodes in SI units, (n_node,)
     """
 
     title: str
@@ -46,46 +42,42 @@ class PaintedField:
         return self.shown * self.at_nodes(model, fields)
 
     def scale_end(self, values: FloatArray) -> float:
-        """End of the scale of values [unit]: the first round number that none exceeds."""
-        length = max(float(values.max()) - self.lowest, self.least)
-        power = 10.0 ** np.floor(np.log10(length))
-        return self.lowest + power * next(step for step in STEPS if step * power >= length * (1.0 - 1e-12))
+        """End of the scale of values [unit]: the largest; NaN if one is."""
+        return float(np.maximum(values.max(), self.lowest + self.least))
 
     def shares(self, values: FloatArray, end: float) -> FloatArray:
-        """Place of values on the scale up to its end [unit], 0 to 1; values below its start have the first colour."""
-        return np.clip((values - self.lowest) / (end - self.lowest), 0.0, 1.0)
+        """Place of values on the scale up to its end [unit], 0 to 1; 0 also below its start, and for NaN."""
+        return np.nan_to_num(np.clip((values - self.lowest) / (end - self.lowest), 0.0, 1.0))
 
-    def text(self, value: float) -> str:
-        """A value [unit] with its unit."""
-        return f"{value:.3g} {self.unit}".rstrip()
-
-
-def _of_triangles(model: OrganModel, fields: TissueFields, values: FloatArray) -> FloatArray:
-    """Mean at each node over the surface triangles around it by present area; 0 inside the organ."""
-    count, corners = len(model.node_mass), model.surface_triangles
-    area = np.bincount(corners.ravel(), np.repeat(fields.area, 3), count)
-    total = np.bincount(corners.ravel(), np.repeat(values * fields.area, 3), count)
-    return np.divide(total, area, out=np.zeros(count), where=area > 0.0)
+    def scale_text(self, end: float) -> str:
+        """Title, start and end [unit] of the scale."""
+        return f"{self.title}: {self.lowest:g} to {end:.3g} {self.unit}"
 
 
-def _of_tets(model: OrganModel, values: FloatArray) -> FloatArray:
-    """Mean at each node over the tets around it by undeformed volume."""
-    quarters = np.repeat(0.25 * values * model.tet_rest_volume, 4)
-    return np.bincount(model.tet_nodes.ravel(), quarters, len(model.node_mass)) / model.node_rest_volume
+def _node_means(model: OrganModel, items: IntArray, values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Mean at each node over the items (n_item, n_corner) around it, by their weights; 0 at nodes of none."""
+    count = items.shape[1]
+    total, weight = (
+        np.bincount(items.ravel(), np.repeat(part, count), len(model.node_mass)) for part in (values * weights, weights)
+    )
+    return np.divide(total, weight, out=total, where=weight > 0.0)
+
+
+def _pressure(model: OrganModel, fields: TissueFields) -> FloatArray:
+    return _node_means(model, model.surface_triangles, fields.pressure, fields.area)
+
+
+def _stretch(model: OrganModel, fields: TissueFields) -> FloatArray:
+    return _node_means(model, model.tet_nodes, fields.principal_stretch[:, 0], model.tet_rest_volume)
 
 
 # By the names of the option `paint`.
 PAINTED_FIELDS = {
-    "pressure": PaintedField(
-        "contact pressure", "kPa", 1e-3, 0.0, 0.1, lambda model, fields: _of_triangles(model, fields, fields.pressure)
-    ),
+    "pressure": PaintedField("contact pressure", "kPa", 1e-3, 0.0, 0.1, _pressure),
     "stress": PaintedField("von Mises stress", "kPa", 1e-3, 0.0, 0.1, lambda _, fields: fields.von_mises),
-    "stretch": PaintedField(
-        "largest principal stretch", "", 1.0, 1.0, 0.01,
-        lambda model, fields: _of_tets(model, fields.principal_stretch[:, 0]),
-    ),
+    "stretch": PaintedField("largest principal stretch", "", 1.0, 1.0, 0.01, _stretch),
     "energy": PaintedField("strain energy density", "kJ/m^3", 1e-3, 0.0, 0.01, lambda _, fields: fields.energy_density),
-}  # fmt: skip
+}
 
 
 @cache
@@ -97,22 +89,16 @@ def field_colours(count: int) -> NDArray[np.uint8]:
 
 
 def draw_bar(frame: NDArray[np.uint8], field: PaintedField, end: float) -> None:
-    """Paint the bar of a field's scale up to its end [unit] into the lower left of a picture (height, width, 3)."""
+    """Paint the scale of a field up to its end [unit] into the lower left of a picture (height, width, 3)."""
     from PIL import Image, ImageDraw, ImageFont
 
-    size = frame.shape[0] / 480.0
-    length, width, gap = (max(1, round(part * size)) for part in (BAR_LENGTH, BAR_WIDTH, BAR_GAP))
     picture = Image.fromarray(frame)
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=max(BAR_TEXT * size, 1.0))
-    line = round(1.25 * BAR_TEXT * size)
-    top = picture.height - gap - width - 2 * line
-    box = (gap // 2, top - gap // 2, length + 3 * gap // 2, picture.height - gap // 2)
-    wide = draw.textlength(field.title, font=font) + 3 * gap // 2
-    draw.rectangle((*box[:2], max(box[2], wide), box[3]), fill=BAR_BACK)
-    draw.text((gap, top), field.title, font=font, fill=BAR_INK)
-    bar = np.broadcast_to(field_colours(length), (width, length, 3))
-    picture.paste(Image.fromarray(np.ascontiguousarray(bar)), (gap, top + line))
-    below = top + line + width
-    draw.text((gap, below), f"{field.lowest:g}", font=font, fill=BAR_INK)
-    draw.text((gap + length, below), field.text(end), font=font, fill=BAR_INK, anchor="ra")
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=TEXT_HEIGHT * picture.height)
+    text, line = field.scale_text(end), round(TEXT_HEIGHT * picture.height)
+    width = round(draw.textlength(text, font=font))
+    top = picture.height - 4 * line
+    draw.rectangle((0, top, width + 2 * line, picture.height), fill="black")
+    draw.text((line, top + line // 2), text, font=font, fill="white")
+    bar = Image.fromarray(np.repeat(field_colours(256)[None], line, axis=0))
+    picture.paste(bar.resize((width, line)), (line, top + 5 * line // 2))
     frame[:] = np.asarray(picture)

@@ -84,8 +84,7 @@ class OrganRenderer:
         self._stage: Stage | None = None
         self._tissue: Tissue | None = None
         self._tissue_lesions: tuple[Lesion, ...] = ()
-        self._field = None if self.options.paint is None else PAINTED_FIELDS[self.options.paint]
-        self._scale_end: float | None = None
+        self._scale_end = 0.0
         self.follow_anatomy()
 
     def follow_anatomy(self) -> None:
@@ -112,8 +111,8 @@ class OrganRenderer:
             frame = stage.canvas.colour()
         if self.look is not None:
             frame = self.look.exposed(frame, self.moment)
-        if self._field is not None and self._scale_end is not None:
-            draw_bar(frame, self._field, self._scale_end)
+        if self.options.paint is not None:
+            draw_bar(frame, PAINTED_FIELDS[self.options.paint], self._scale_end)
         if self.options.show_force:
             draw_forces(frame, self._simulation, view)
         return frame
@@ -186,8 +185,8 @@ class OrganRenderer:
             self._tissue_lesions = shown
         nodes, tissue, scene = simulation.organ_state.node_position, self._tissue, stage.scene
         shapes = tissue.shapes(nodes)
-        if self._field is not None:
-            self._paint(shapes, self._field, tissue)
+        if options.paint is not None:
+            self._paint(shapes, PAINTED_FIELDS[options.paint], tissue)
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             triangles = simulation.anatomy.mesh.boundary_triangles
@@ -196,20 +195,18 @@ class OrganRenderer:
         lesions = tissue.lesion_ellipsoids(nodes) if options.show_lesion else []
         stage.show(camera, shapes, simulation.instrument.data, lesions, self.target, self.look)
 
-
     def _paint(self, shapes: dict[str, Shape], field: PaintedField, tissue: Tissue) -> None:
-        """Give the shapes of tissue the colours of a field; a diverged organ has none, and its picture no bar."""
-        simulation, self._scale_end = self._simulation, None
+        """Give the shapes of tissue their places on a field's scale, whose end is NaN for a diverged organ."""
+        model = self._simulation.organ_model
         try:
-            nodes = field.node_values(simulation.organ_model, simulation.fields())
+            nodes = field.node_values(model, self._simulation.fields())
         except OrganDivergedError:
-            shares = {name: np.zeros(len(shapes[name].vertices)) for name in shapes}
-        else:
-            values = tissue.vertex_values(nodes)
-            self._scale_end = end = field.scale_end(np.concatenate(list(values.values())))
-            shares = {name: field.shares(value, end) for name, value in values.items()}
-        for name, share in shares.items():
-            shapes[name] = replace(shapes[name], face_places=shapes[name].faces, shares=share)
+            nodes = np.full(len(model.node_mass), np.nan)
+        values = tissue.vertex_values(nodes)
+        self._scale_end = field.scale_end(np.concatenate(list(values.values())))
+        for name, value in values.items():
+            shares = field.shares(value, self._scale_end)
+            shapes[name] = replace(shapes[name], face_places=shapes[name].faces, shares=shares)
 
 
 def ground_shadow(

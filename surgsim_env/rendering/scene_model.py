@@ -1,7 +1,7 @@
 """Drawn scene as a MuJoCo model of its own, never simulated: organ, sections, instrument, drape, lights."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -52,10 +52,6 @@ FINISHES = {
     "section_lesion": Finish((0.980, 0.860, 0.500), 0.10, 0.20, 0.25),
     "shadow": Finish((0.055, 0.150, 0.170), 0.0, 0.0),
 }
-# Of tissue under a painted field, whose colours are multiplied by it: the lights together then add up to 1.
-PAINTED_COLOUR = (0.78, 0.78, 0.78)
-# Meshes of tissue, on which fields are painted.
-TISSUE = ("organ", "held", "section", "section_lesion")
 LESION_COLOUR = (0.98, 0.84, 0.42)
 TARGET_COLOUR = (0.20, 0.75, 0.35)
 # Width of the drape's squares [m], a scale for the eye.
@@ -65,10 +61,10 @@ BACKGROUND_COLOUR = (0.045, 0.105, 0.120)
 # Half the drape's width in radii of the organ, and its distance below the organ [m].
 DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
-# Name of the texture of vessels, white until a look draws them.
+# Tissue on which fields are painted, and the colour that multiplies theirs: the lights add up to more than 1.
+PAINTED, PAINTED_COLOUR = ("organ", "held", "section", "section_lesion"), (0.78, 0.78, 0.78)
+# Name of the texture of vessels or a field, white until a look draws them.
 VESSELS = "vessels"
-# Name of the texture of a painted field, and its width [pixels]: the scale there and back, as textures repeat.
-FIELD, FIELD_WIDTH = "field", 512
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
 # MuJoCo accepts no empty or flat mesh: before the first picture a mesh consists of copies of this tetrahedron.
@@ -97,10 +93,9 @@ class DrawnMesh:
         for array in (model.mesh_face, model.mesh_facenormal):
             array[first : first + len(shape.faces)] = shape.faces
         if shape.shares is not None:
-            # Between the middles of the first and the last pixel of the way there.
-            pixels = 0.5 + (0.5 * FIELD_WIDTH - 1.0) * shape.shares
-            at = model.mesh_texcoordadr[mesh]
-            model.mesh_texcoord[at : at + count, 0] = pixels / FIELD_WIDTH
+            # The second half of the texture leads back.
+            first_place = model.mesh_texcoordadr[mesh]
+            model.mesh_texcoord[first_place : first_place + count, 0] = 0.5 * shape.shares
         if shape.face_places is not None:
             model.mesh_facetexcoord[first : first + len(shape.faces)] = shape.face_places
         self._face_count = len(shape.faces)
@@ -161,28 +156,37 @@ def build_scene(
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
-    painted = options.paint is not None
-    if painted:
-        there = field_colours(FIELD_WIDTH // 2)
-        field = spec.add_texture(name=FIELD, type=mujoco.mjtTexture.mjTEXTURE_2D, width=FIELD_WIDTH, height=1)
-        field.nchannel, field.data = 3, np.concatenate([there, there[::-1]]).tobytes()
+    if options.paint is not None:
+        # Room for a place of each vertex on the scale, in all shapes.
+        places = np.zeros((max(room[0] for room in meshes.values()), 2), dtype=np.float32)
     vessels = spec.add_texture(name=VESSELS, type=mujoco.mjtTexture.mjTEXTURE_2D, width=TEXTURE_SIZE)
     vessels.height, vessels.builtin = TEXTURE_SIZE, mujoco.mjtBuiltin.mjBUILTIN_FLAT
     vessels.rgb1 = vessels.rgb2 = [1.0, 1.0, 1.0]
     for name, (vertices, faces) in meshes.items():
         whole = name in ("organ", "held")
         opacity = TRANSLUCENT if options.show_lesion and whole else 1.0
-        if painted and name in TISSUE:
-            add_tissue(spec, name, vertices, faces, opacity, np.zeros((vertices, 2), dtype=np.float32), painted=True)
-        else:
-            add_tissue(spec, name, vertices, faces, opacity, places if whole else None)
+        textured = whole or options.paint is not None
+        add_tissue(spec, name, vertices, faces, opacity, places if textured else None)
     add_instrument(spec, instrument)
     model, data, drawn = compile_scene(spec, meshes)
     geoms = find_instrument(model, instrument)
-    if painted:
-        # The painted contact lies under the tip.
-        model.geom_rgba[geoms.target, 3] = TRANSLUCENT
+    if options.paint is not None:
+        _paint(model, geoms)
     return SceneModel(model, data, drawn, geoms, light, ground, anatomy.downward)
+
+
+def _paint(model: mujoco.MjModel, instrument: InstrumentGeoms) -> None:
+    """Give tissue the colours of a scale as a texture; the instrument before it becomes translucent."""
+    texture, there = model.texture(VESSELS), field_colours(TEXTURE_SIZE // 2)
+    # There and back, since textures repeat.
+    rows = np.tile(np.concatenate([there, there[::-1]]), (TEXTURE_SIZE, 1))
+    model.tex_data[texture.adr[0] :][: rows.size] = rows.ravel()
+    for name in PAINTED:
+        material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, name)
+        if material >= 0:
+            model.mat_rgba[material, :3] = PAINTED_COLOUR
+            model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.id
+    model.geom_rgba[instrument.target, 3] = TRANSLUCENT
 
 
 def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4, far: float = FAR) -> mujoco.MjSpec:
@@ -207,21 +211,15 @@ def add_tissue(
     face_count: int,
     opacity: float = 1.0,
     texture_places: NDArray[np.float32] | None = None,
-    *,
-    painted: bool = False,
 ) -> None:
     """Add a mesh with the finish of its name, with space for `vertex_count` vertices and `face_count` triangles.
 
-    Texture places (n_place, 2) let its triangles be textured; with `painted` they are by the colours of a field.
+    Texture places (n_place, 2) let its triangles be textured.
     """
     finish = FINISHES[name]
-    if painted:
-        finish = replace(finish, colour=PAINTED_COLOUR)
     material = spec.add_material(name=name, specular=finish.specular, shininess=finish.shininess)
     material.rgba = [*finish.colour, opacity]
     material.emission = finish.emission
-    if painted:
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FIELD
     corner = np.resize(np.arange(4), max(vertex_count, 4))
     faces = np.resize(_TETRAHEDRON_FACES.ravel(), 3 * max(face_count, 4))
     mesh = spec.add_mesh(name=name)

@@ -139,9 +139,7 @@ class Stage:
         self.surface = boundary_surface(anatomy, most) if options.cut_away else organ_surface(anatomy, most)
         self.scene = build_scene(anatomy, self.surface, instrument, options)
         self.canvas = Canvas(self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1)
-        painted = options.paint is not None
-        has_vessels = not (options.cut_away or painted)
-        self._look = DrawnLook(self.scene, self.canvas.context, has_vessels=has_vessels, painted=painted)
+        self._look = DrawnLook(self.scene, self.canvas.context, options)
         # Labels of geoms beyond the model's, by their numbers in the picture.
         self._added: dict[int, int] = {}
 

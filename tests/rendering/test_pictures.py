@@ -196,3 +196,24 @@ def test_renderers_share_their_meshes_and_give_them_back(make_press, draw):
     renderers.clear()
     del frames
     draw(presses[0]).close()
+
+
+@pytest.mark.parametrize("options", [{}, {"cut_away": True}], ids=str)
+def test_a_field_is_painted_where_it_is(press, draw, options):
+    """Contact pressure colours the organ below the tip alone, and the picture without the option stays as it was."""
+    press.press(0.006)
+    plain = draw(press, **options).rgb()
+    fields = {
+        kind: draw(press, paint=kind, show_force=False, camera="above", **options) for kind in ("pressure", "stress")
+    }
+    pressure = fields["pressure"]
+    frame, organ = pressure.rgb().astype(int), pressure.segmentation() == ORGAN
+    # Viridis begins with purple, and has more green than red from a fifth of its scale to its middle and beyond.
+    purple = (frame[..., 2] > frame[..., 1]) & (frame[..., 0] > frame[..., 1])
+    assert purple[organ].mean() > 0.9
+    camera, simulation = pressure.cameras["above"], press.simulation
+    (place,), _ = camera.project(simulation.contact_centre[None], 640, 480)
+    column, row = np.round(place).astype(int)
+    assert frame[row, column, 1] > frame[row, column, 0]
+    assert (fields["stress"].rgb() != pressure.rgb()).any()
+    np.testing.assert_array_equal(draw(press, **options).rgb(), plain)

@@ -45,7 +45,7 @@ class PaintedTissue:
         if organ != self._organ or step < self._step:
             self.end = 0.0
         self._organ, self._step = organ, step
-        simulation.set_state(self._model, {name: record[name] for name in record.dtype.names if name != "organ"})
+        simulation.set_state(self._model, {name: record[name] for name in simulation.get_state()})
         try:
             values = field.node_values(self._model, simulation.fields())
         except OrganDivergedError:

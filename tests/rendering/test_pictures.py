@@ -209,5 +209,6 @@ def test_a_field_is_painted_where_it_is(press, draw, cut_away):
     rows, columns = np.nonzero((labels == ORGAN) & (frame[..., 1] > frame[..., 0]))
     assert 0 < len(rows) < 0.2 * (labels == ORGAN).sum()
     (place,), _ = renderer.cameras["overview"].project(press.simulation.contact_centre[None], 640, 480)
-    assert np.linalg.norm(np.median([columns, rows], axis=1) - place) < 40.0
+    # Within a radius of the ball, 50 to 60 pixels, around and below the contact.
+    assert np.linalg.norm(np.median([columns, rows], axis=1) - place) < 60.0
     np.testing.assert_array_equal(draw(press, cut_away=cut_away).rgb(), plain)

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
@@ -143,9 +143,9 @@ def hand_type(arm_count: int) -> np.dtype:
 def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
     """Physics to page, some 60 times a second.
 
-    phase, organ (its number, from 1), recording, the number of recordings begun, True for a held breath, time [s] since
-    the reset, a message (a fault or a refusal), added_mass [kg]; for each arm its tip [m] and the force of tissue on it
-    [N]; nodes [m]; positions [m] and rotations of geoms.
+    phase, organ (1, and 1 more for each Change up to its own), recording, the number of recordings begun, True for a
+    held breath, time [s] since the reset, a message (a fault or a refusal), added_mass [kg]; for each arm its tip [m]
+    and the force of tissue on it [N]; nodes [m]; positions [m] and rotations of geoms.
     """
     arms = (arm_count, 3)
     return np.dtype(
@@ -156,6 +156,11 @@ def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
             ("geom", "f4", (geom_count, 3)), ("turn", "f4", (geom_count, 9)),
         ]
     )  # fmt: skip
+
+
+def tissue_type(state: Mapping[str, NDArray[Any]]) -> np.dtype:
+    """Physics to page, with each frame while a field is painted: the organ's number, `Simulation.get_state()`."""
+    return np.dtype([("organ", "i8"), *((name, array.dtype, array.shape) for name, array in state.items())])
 
 
 def trace_type(arm_count: int) -> np.dtype:
@@ -229,16 +234,18 @@ class Exchange:
 
     hand: SharedRecord
     frame: SharedRecord
+    tissue: SharedRecord
     trace: SharedRecord
     timing: SharedRecord
     recorded: RecordedSteps
 
 
-def new_exchange(arm_count: int, node_count: int, geom_count: int) -> Exchange:
-    """Allocate the memory of one session."""
+def new_exchange(arm_count: int, node_count: int, geom_count: int, state: Mapping[str, NDArray[Any]]) -> Exchange:
+    """Allocate the memory of one session; `state` is one of its simulation."""
     return Exchange(
         hand=SharedRecord(hand_type(arm_count)),
         frame=SharedRecord(frame_type(arm_count, node_count, geom_count)),
+        tissue=SharedRecord(tissue_type(state)),
         trace=SharedRecord(trace_type(arm_count)),
         timing=SharedRecord(TIMING),
         recorded=RecordedSteps(arm_count),
@@ -275,8 +282,15 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Paint:
+    """Begin or end the copies of the tissue's state, from which the page computes a field."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
 class End:
     """End the physics' process."""
 
 
-Request = Pause | Reset | Change | Record | End
+Request = Pause | Reset | Change | Record | Paint | End

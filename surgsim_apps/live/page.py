@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,20 @@ from surgsim_apps.live.exchange_records import Change, LiveError, Pause, Phase, 
 from surgsim_apps.live.guarded_server import GuardedServer
 from surgsim_apps.live.messages import SOFTWARE, read_hand
 from surgsim_apps.live.organ_choice import chosen_lesions
+from surgsim_apps.live.painted_tissue import PaintedTissue
 from surgsim_apps.live.panel import Panel, status_rows
 from surgsim_apps.live.recording import write_recording
 from surgsim_apps.live.session import Session
-from surgsim_apps.live.stage import SCALE, FeltMap, ForceArrow, InstrumentView, OrganView, Surroundings, add_handle
+from surgsim_apps.live.stage import (
+    SCALE,
+    STIFFNESS_MAP,
+    FeltMap,
+    ForceArrow,
+    InstrumentView,
+    OrganView,
+    Surroundings,
+    add_handle,
+)
 
 # Between updates of the plots, and of the status text [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
@@ -76,6 +87,9 @@ class Page:
         self._tabs = HandSockets(session)
         self.server = GuardedServer(port, self._tabs.serve)
         self.felt = FeltMap(session.anatomy)
+        self._tissue, self._chosen_paint = PaintedTissue(session), STIFFNESS_MAP
+        self._painter = ThreadPoolExecutor(1, "surgsim paint")
+        self._shares = self._painter.submit(self._tissue.shares)
         self.pictures = 0
         self._organ_number, self._traced = 1, 0
         self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -121,12 +135,15 @@ class Page:
             "reset": self._reset,
             "record": lambda: session.ask(Record(not session.frame()["recording"])),
             "show_lesions": self._show_lesions,
-            "paint": self._organ.show_paint,
+            "paint": self._choose_paint,
             "clear_map": self.felt.clear,
             "close_jaw": session.close_jaw,
             "hold_breath": session.hold_breath,
             "plain": self.show_plain,
         }
+
+    def _choose_paint(self, kind: str) -> None:
+        self._chosen_paint = kind
 
     def show_plain(self, on: bool) -> None:
         """Turn shadows and reflections off or on, in every tab."""
@@ -243,7 +260,7 @@ class Page:
 
     def _show(self, frame: np.ndarray) -> None:
         """Update the picture."""
-        self._organ.paint(self.felt)
+        self._paint()
         self._organ.follow(frame["node"].astype(np.float64))
         self._instrument.follow(frame["geom"], frame["turn"])
         for arrow, tip, force in zip(self._arrows, frame["tip"], frame["force"], strict=True):
@@ -252,6 +269,22 @@ class Page:
         for arm, handle in enumerate(self._handles):
             if arm not in self._held and np.abs(handle.position / SCALE - targets[arm]).max() > 1e-6:
                 handle.position = targets[arm] * SCALE
+
+    def _paint(self) -> None:
+        """Update the paint; here, since calls of the panel come from other threads."""
+        kind, tissue = self._chosen_paint, self._tissue
+        self._organ.paint(self.felt)
+        if not self._shares.done():
+            return
+        shares = self._shares.result()
+        if shares is not None:
+            self._organ.paint_field(shares)
+        if kind != self._organ.paints:
+            self._organ.show_paint(kind)
+            tissue.choose(kind)
+        self._panel.show_legend(kind, tissue.end)
+        # Compiling another organ takes a second or more, in which pictures go on.
+        self._shares = self._painter.submit(tissue.shares)
 
     def _say(self, frame: np.ndarray) -> None:
         """Update the status text."""

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from surgsim_apps.haptics.pacing import Timeliness
 from surgsim_apps.live.exchange_records import Phase
 from surgsim_apps.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
-from surgsim_apps.live.stage import COLOURS, CONTRASTS
+from surgsim_apps.live.stage import CONTRASTS, NOTHING, STIFFNESS_MAP, paint_colours
+from surgsim_env.rendering import PAINTED_FIELDS
 from surgsim_env.scene import Scene
 
 # Time span of the plots [s], and their number of points.
@@ -20,6 +21,12 @@ PLOTTED, PLOT_POINTS = 10.0, 250
 PLOT_LEAST = {"N": 0.5, "mm": 4.0}
 # Time without a motion of the sliders before a change applies [s].
 SETTLED = 0.35
+# Choices of the paint, with their names.
+PAINTS = {
+    "none": NOTHING,
+    "stiffness map": STIFFNESS_MAP,
+    **{field.title: name for name, field in PAINTED_FIELDS.items()},
+}
 BUTTON_COLOUR = (52, 84, 96)
 ARM_COLOURS = ("#e8590c", "#1971c2")
 TITLES = {
@@ -64,7 +71,8 @@ class Panel:
             arm_count: 1 or 2.
             has_jaw: True if the first arm has a jaw.
             calls: callbacks by name: pause() and record(), which toggle;
-                reset(), show_lesions(on), paint(on), clear_map(), close_jaw(on), hold_breath(on), plain(on).
+                reset(), show_lesions(on), paint(value of PAINTS), clear_map(), close_jaw(on), hold_breath(on),
+                plain(on).
         """
         self._gui, self._scene, self._calls = gui, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
@@ -79,10 +87,11 @@ class Panel:
             self._depth = _plot(gui, "mm", arm_count)
         with gui.add_folder("Tissue"):
             self._add_tissue()
-        with gui.add_folder("Stiffness map"):
-            gui.add_html(_legend_html())
-            self._checkbox("Paint it on the organ", "paint", initial_value=True)
-            self._button("Clear", "clear the stiffness map", calls["clear_map"])
+        with gui.add_folder("Colours"):
+            self._paint = gui.add_dropdown("Paint", tuple(PAINTS), initial_value="stiffness map")
+            self._paint.on_update(lambda _: self._calls["paint"](PAINTS[self._paint.value]))
+            self._legend = gui.add_html(_legend_html(STIFFNESS_MAP, 0.0))
+            self._clear = self._button("Clear", "clear the stiffness map", calls["clear_map"])
         self._plain = self._checkbox("Plain light", "plain", hint="faster without a graphics card")
         with gui.add_folder("How to steer", expand_by_default=False):
             second = "\n| X, or a shoulder button | the other arm |" if arm_count > 1 else ""
@@ -111,6 +120,12 @@ class Panel:
     def show_plain(self, on: bool) -> None:
         """Set its check box."""
         _set(self._plain, "value", on)
+
+    def show_legend(self, kind: str, end: float) -> None:
+        """Show the colours of a kind of paint; `end` is that of a field's scale, in its unit."""
+        _set(self._legend, "content", _legend_html(kind, end))
+        _set(self._legend, "visible", kind != NOTHING)
+        _set(self._clear, "visible", kind == STIFFNESS_MAP)
 
     def plot(self, trace: np.ndarray) -> None:
         """Show a trace's rows: time [s], force [N] and depth [m] of each arm."""
@@ -233,14 +248,15 @@ def _status_html(headline: str, rows: list[tuple[str, str]]) -> str:
     )
 
 
-def _legend_html() -> str:
-    colours = ", ".join(f"rgb{colour}" for colour in COLOURS)
+def _legend_html(kind: str, end: float) -> str:
     low, high = CONTRASTS
+    text = f"stiffness over the lower quartile: {low:g} to {high:g} and more"
+    if kind in PAINTED_FIELDS:
+        text = PAINTED_FIELDS[kind].scale_text(end)
+    colours = ", ".join(f"rgb{colour}" for colour in paint_colours(kind))
     return (
         '<div style="padding:.2em .9em;font-size:.8em"><div style="height:.7em;border-radius:.35em;'
-        f'background:linear-gradient(to right, {colours})"></div>'
-        f'<div style="display:flex;justify-content:space-between"><span>{low:g}</span><span>stiffness over the lower '
-        f"quartile</span><span>{high:g} and more</span></div></div>"
+        f'background:linear-gradient(to right, {colours})"></div>{text}</div>'
     )
 
 

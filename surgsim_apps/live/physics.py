@@ -25,6 +25,7 @@ from surgsim_apps.live.exchange_records import (
     Change,
     End,
     Exchange,
+    Paint,
     Pause,
     Phase,
     Record,
@@ -134,7 +135,8 @@ class Physics:
         self._exchange, self._requests, self._anatomy = exchange, requests, anatomy
         self._simulation = Simulation(self._anatomy)
         self._organ: OrganModel = chosen_organ(self._anatomy, choice)
-        self._organ_number = 1
+        self._organ_number = self._changes = 1
+        self._paints = False
         instrument = self._simulation.instrument
         self._home = home_of(self._anatomy, instrument)
         self._simulation.reset(self._organ, self._home)
@@ -201,6 +203,8 @@ class Physics:
             self._change(request.choice)
         elif isinstance(request, Record):
             self._record(request.on)
+        elif isinstance(request, Paint):
+            self._paints = request.on
         self._write_frame()
 
     def _rest(self, organ: OrganModel | None = None) -> None:
@@ -222,9 +226,10 @@ class Physics:
 
     def _change(self, choice: OrganChoice) -> None:
         before, number = self._organ, self._organ_number
+        self._changes += 1
         try:
             organ = chosen_organ(self._anatomy, choice)
-            self._organ_number += 1
+            self._organ_number = self._changes
             self._rest(organ)
             self._organ = organ
         except ValueError as error:
@@ -287,6 +292,11 @@ class Physics:
                 frame["force"][arm] = tip.contact_force
             frame["node"] = simulation.organ_state.node_position[:, :3]
             frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
+        if self._paints:
+            with self._exchange.tissue.writing() as tissue:
+                tissue["organ"] = self._organ_number
+                for name, array in simulation.get_state().items():
+                    tissue[name] = array
 
 
 # Unix niceness (scheduling priority); values below 0 need the right to set them.

@@ -45,10 +45,10 @@ class Session:
     """Starts the physics' process and communicates with it; every method may be called from any thread.
 
     Fields:
-        anatomy, instrument: copies of the physics' ones; the instrument stays parked
+        anatomy, simulation, instrument: copies of the physics' ones; they stay at rest while no field is painted
         exchange: memory shared with the physics
         parked: initial positions of the tips [m]                                 (n_arm, 3)
-        choice: the organ requested last
+        choices: organs requested so far; a frame's `organ` is the number of its own, from 1
         directions: unit vectors right, away and out of the view, as rows         (3, 3)
     """
 
@@ -66,12 +66,15 @@ class Session:
             ValueError: a scene without a valid instrument.
         """
         self.anatomy, self.scene = anatomy, anatomy.scene
-        self.instrument = Simulation(self.anatomy).instrument
+        self.simulation = Simulation(self.anatomy)
+        self.instrument = self.simulation.instrument
         self.parked = np.atleast_2d(home_of(self.anatomy, self.instrument)).copy()
-        self.choice = OrganChoice(lesions=lesion_kinds(self.scene)[0])
+        self.choices = [OrganChoice(lesions=lesion_kinds(self.scene)[0])]
         self.directions = np.eye(3)
         self.geoms = shown_geoms(self.instrument.model)
-        self.exchange: Exchange = new_exchange(len(self.parked), self.anatomy.mesh.node_count, len(self.geoms))
+        self.exchange: Exchange = new_exchange(
+            len(self.parked), self.anatomy.mesh.node_count, len(self.geoms), self.simulation.get_state()
+        )
         self._targets = self.parked.copy()
         self._buttons = np.zeros(len(self.parked), dtype=np.int64)
         self._motions: dict[int, tuple[FloatArray, float]] = {}
@@ -96,6 +99,11 @@ class Session:
     def arm_count(self) -> int:
         """Number of tips."""
         return len(self.parked)
+
+    @property
+    def choice(self) -> OrganChoice:
+        """The organ requested last."""
+        return self.choices[-1]
 
     @property
     def targets(self) -> FloatArray:
@@ -156,7 +164,7 @@ class Session:
         """Send a request; its effect appears in later frames."""
         with self._lock:
             if isinstance(request, Change):
-                self.choice = request.choice
+                self.choices.append(request.choice)
             # Without the physics, `alive` is False.
             with contextlib.suppress(OSError):
                 self._pipe.send(request)

@@ -12,7 +12,16 @@ from scipy.spatial import KDTree
 from msdm_core.material import Lesion
 from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.palpation import Indenter
-from surgsim_env.rendering import Camera, geom_colour, is_support, lesion_ball, mesh_rows, organ_surface, scene_cameras
+from surgsim_env.rendering import (
+    Camera,
+    field_colours,
+    geom_colour,
+    is_support,
+    lesion_ball,
+    mesh_rows,
+    organ_surface,
+    scene_cameras,
+)
 from surgsim_env.scene import Anatomy
 
 # The page's scene is in decimetres: viser's cameras and handles are made for scenes of some metres.
@@ -57,6 +66,8 @@ COLOURS = (
     (240, 117, 48),
     (205, 46, 46),
 )
+# Kinds of paint, beside the names of fields.
+STIFFNESS_MAP, NOTHING = "map", ""
 # Offset of the paint above the surface [m].
 PAINT_ABOVE = 0.0004
 NO_FACES = np.zeros((0, 3), dtype=np.int32)
@@ -167,7 +178,7 @@ class OrganView:
     """Nodes of a viser scene for an organ, its paint, and its lesions.
 
     Fields:
-        paints: True while the stiffness map is shown
+        paints: STIFFNESS_MAP, NOTHING or the name of a field
     """
 
     def __init__(self, scene: Any, anatomy: Anatomy) -> None:
@@ -180,7 +191,7 @@ class OrganView:
         self._organ = scene.add_mesh_simple("/organ", _scaled(vertices), faces, color=ORGAN_COLOUR, opacity=None)
         self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(COLOURS)]
         self._painted, self._fresh = -1, 1
-        self.paints = True
+        self.paints = STIFFNESS_MAP
         self._lesions: list[tuple[Any, Any]] = []
 
     def follow(self, node_position: FloatArray) -> None:
@@ -199,26 +210,35 @@ class OrganView:
 
     def paint(self, felt: FeltMap) -> None:
         """Update the colours of the stiffness map; the softest part is blue."""
-        if not self.paints or felt.version == self._painted:
+        if self.paints != STIFFNESS_MAP or felt.version == self._painted:
             return
-        self._painted, self._fresh = felt.version, 1
+        self._painted = felt.version
         value = np.full(len(self._points), np.nan)
         known = felt.felt
         value[felt.nodes[known]] = felt.contrast[known]
         vertex = self._surface.interpolate(np.nan_to_num(value))
         vertex[self._surface.interpolate(np.isnan(value).astype(np.float64)) > 1e-9] = np.nan
         face = vertex[self._surface.faces].mean(axis=1)
-        level = colour_levels(face)
+        self._cover(colour_levels(face))
+
+    def paint_field(self, shares: FloatArray) -> None:
+        """Update the colours of a field from the places of the nodes on its scale, 0 to 1, (n_node,)."""
+        face = self._surface.interpolate(shares)[self._surface.faces].mean(axis=1)
+        self._cover(np.minimum((face * len(COLOURS)).astype(np.int64), len(COLOURS) - 1))
+
+    def show_paint(self, kind: str) -> None:
+        """Show STIFFNESS_MAP, NOTHING or a field by its name, which `paint` or `paint_field` then colour."""
+        self.paints, self._painted = kind, -1
+        for paint, colour in zip(self._paint, paint_colours(kind), strict=True):
+            paint.colour = colour
+            paint.cover(NO_FACES)
+            paint.follow(np.zeros((0, 3), dtype=np.float32))
+
+    def _cover(self, level: np.ndarray) -> None:
+        """Paint each triangle in the colour of its level, from 0; -1 for none, (n_face,)."""
+        self._fresh = 1
         for index, paint in enumerate(self._paint):
             paint.cover(self._surface.faces[level == index])
-
-    def show_paint(self, on: bool) -> None:
-        """Show or hide the stiffness map."""
-        self.paints, self._painted, self._fresh = on, -1, 1
-        if not on:
-            for paint in self._paint:
-                paint.cover(NO_FACES)
-                paint.follow(np.zeros((0, 3), dtype=np.float32))
 
     def show_lesions(self, lesions: Sequence[Lesion]) -> None:
         """Show lesions inside a translucent organ; an empty list makes it opaque."""
@@ -242,7 +262,7 @@ class _Paint:
     """The part of the surface in one colour."""
 
     def __init__(self, scene: Any, name: str, colour: tuple[int, int, int]) -> None:
-        self._scene, self._name, self._colour = scene, name, colour
+        self._scene, self._name, self.colour = scene, name, colour
         self._used = np.zeros(0, dtype=np.int64)
         self._node: Any = None
         self._local = None
@@ -255,17 +275,22 @@ class _Paint:
         if self._node is None:
             if len(self._used):
                 self._node = self._scene.add_mesh_simple(
-                    self._name, vertices[self._used], self._local, color=self._colour, cast_shadow=False
+                    self._name, vertices[self._used], self._local, color=self.colour, cast_shadow=False
                 )
                 self._local = None
             return
         if self._local is not None:
-            self._node.visible = bool(len(self._used))
+            self._node.visible, self._node.color = bool(len(self._used)), self.colour
         if not len(self._used):
             return
         self._node.vertices = vertices[self._used]
         if self._local is not None:
             self._node.faces, self._local = self._local, None
+
+
+def paint_colours(kind: str) -> Sequence[tuple[int, int, int]]:
+    """Colours of a kind of paint, from low to high."""
+    return COLOURS if kind in (STIFFNESS_MAP, NOTHING) else [tuple(row) for row in field_colours(len(COLOURS)).tolist()]
 
 
 def colour_levels(contrast: FloatArray) -> np.ndarray:

@@ -278,6 +278,7 @@ class Simulation:
         self._place_supports()
         state.volume_ratio_smallest[:] = 1.0
         self.instrument.place(tip_position)
+        self.instrument.read_shapes()
         self._wrench[:] = 0.0
         self.instrument.shapes.taxel_force[:] = 0.0
         self.fault = ""
@@ -492,6 +493,7 @@ class Simulation:
             self._breath_ends = self.holds_breath
             self._motion_start = int(arrays["motion_start"])
         self.instrument.set_state(arrays["instrument"])
+        self.instrument.read_shapes()
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()
         self._wrench[:] = arrays["wrench"]

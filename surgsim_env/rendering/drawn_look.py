@@ -5,6 +5,7 @@ import numpy as np
 
 from surgsim_env.instruments.tool_bodies import SUPPORT_PREFIX
 from surgsim_env.rendering.looks import Look
+from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.scene_model import TARGET_COLOUR, VESSELS, SceneModel
 from surgsim_env.rendering.vessels import vessel_texture
 
@@ -19,8 +20,8 @@ _RGB, _ROLES = int(mujoco.mjtTextureRole.mjTEXROLE_RGB), int(mujoco.mjtTextureRo
 class DrawnLook:
     """Current look of a drawn scene; None is the scene's own."""
 
-    def __init__(self, scene: SceneModel, context: mujoco.MjrContext, *, has_vessels: bool) -> None:
-        """Keep the scene's own colours and lights; without vessels tissue has one colour."""
+    def __init__(self, scene: SceneModel, context: mujoco.MjrContext, options: RenderOptions) -> None:
+        """Keep the scene's own colours and lights; a cut-away organ has no vessels, a painted one keeps its paint."""
         self._scene, self._context = scene, context
         model, head = scene.model, scene.model.vis.headlight
         self._changed = [
@@ -32,12 +33,13 @@ class DrawnLook:
             )
         ]
         names = [model.material(index).name for index in range(model.nmat)]
-        self._tissue = [names.index(name) for name in TISSUE if name in names]
+        is_painted = options.paint is not None
+        self._tissue = [] if is_painted else [names.index(name) for name in TISSUE if name in names]
         self._drape = [names.index(name) for name in ("drape",) if name in names]
         drawn = scene.instrument.target
         support = np.array([model.geom(index).name.startswith(SUPPORT_PREFIX) for index in drawn], dtype=np.bool_)
         self._supports, self._instrument = drawn[support], drawn[~support]
-        self._vessels = model.texture(VESSELS).id if has_vessels else -1
+        self._vessels = model.texture(VESSELS).id if not (options.cut_away or is_painted) else -1
         self._worn: Look | None = None
 
     @property

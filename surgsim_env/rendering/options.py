@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Any
 
+from surgsim_env.rendering.painted_fields import PAINTED_FIELDS
 from surgsim_env.scene.load import nearest, require_known
 
 # Cameras of each scene.
@@ -28,6 +29,7 @@ class RenderOptions:
         show_lesion: the organ is translucent and its lesions are solid inside.
         cut_away: the organ is cut open through its first lesion (without one, through its palpable face).
         smooth_edges: four samples for each pixel; without it pictures take half the time.
+        paint: field painted on the organ, a name of `painted_fields.PAINTED_FIELDS`; None for none.
 
     Raises:
         ValueError: names the option, its value and the rule.
@@ -40,9 +42,12 @@ class RenderOptions:
     show_lesion: bool = False
     cut_away: bool = False
     smooth_edges: bool = True
+    paint: str | None = None
 
     def __post_init__(self) -> None:
         check_camera(self.camera)
+        if self.paint is not None:
+            require_known("paint", self.paint, PAINTED_FIELDS)
         for name in ("width", "height"):
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= PIXELS_MOST:

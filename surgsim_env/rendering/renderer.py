@@ -4,13 +4,14 @@ import contextlib
 import math
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels.contact_kernels import QUADRATURE_BARYCENTRIC, QUADRATURE_COUNT
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
@@ -19,6 +20,7 @@ from surgsim_env.rendering import gl
 from surgsim_env.rendering.cameras import Camera, scene_cameras
 from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import RenderOptions, check_camera
+from surgsim_env.rendering.painted_fields import PAINTED_FIELDS, PaintedField, draw_bar
 from surgsim_env.rendering.scene_model import (
     add_instrument,
     add_lights,
@@ -82,6 +84,7 @@ class OrganRenderer:
         self._stage: Stage | None = None
         self._tissue: Tissue | None = None
         self._tissue_lesions: tuple[Lesion, ...] = ()
+        self._scale_end = 0.0
         self.follow_anatomy()
 
     def follow_anatomy(self) -> None:
@@ -108,6 +111,8 @@ class OrganRenderer:
             frame = stage.canvas.colour()
         if self.look is not None:
             frame = self.look.exposed(frame, self.moment)
+        if self.options.paint is not None:
+            draw_bar(frame, PAINTED_FIELDS[self.options.paint], self._scale_end)
         if self.options.show_force:
             draw_forces(frame, self._simulation, view)
         return frame
@@ -180,6 +185,8 @@ class OrganRenderer:
             self._tissue_lesions = shown
         nodes, tissue, scene = simulation.organ_state.node_position, self._tissue, stage.scene
         shapes = tissue.shapes(nodes)
+        if options.paint is not None:
+            self._paint(shapes, PAINTED_FIELDS[options.paint], tissue)
         if "shadow" in scene.meshes:
             up = -simulation.anatomy.downward
             triangles = simulation.anatomy.mesh.boundary_triangles
@@ -187,6 +194,19 @@ class OrganRenderer:
             shapes["shadow"] = ground_shadow(nodes, triangles, light, scene.ground, up)
         lesions = tissue.lesion_ellipsoids(nodes) if options.show_lesion else []
         stage.show(camera, shapes, simulation.instrument.data, lesions, self.target, self.look)
+
+    def _paint(self, shapes: dict[str, Shape], field: PaintedField, tissue: Tissue) -> None:
+        """Give the shapes of tissue their places on a field's scale, whose end is NaN for a diverged organ."""
+        model = self._simulation.organ_model
+        try:
+            nodes = field.node_values(model, self._simulation.fields())
+        except OrganDivergedError:
+            nodes = np.full(len(model.node_mass), np.nan)
+        values = tissue.vertex_values(nodes)
+        self._scale_end = field.scale_end(np.concatenate(list(values.values())))
+        for name, value in values.items():
+            shares = field.shares(value, self._scale_end)
+            shapes[name] = replace(shapes[name], face_places=shapes[name].faces, shares=shares)
 
 
 def ground_shadow(

@@ -13,6 +13,7 @@ from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_PREFIX
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.embedding import EmbeddedSurface
 from surgsim_env.rendering.options import RenderOptions
+from surgsim_env.rendering.painted_fields import field_colours
 from surgsim_env.rendering.surface import DrawnSurface, Shape
 from surgsim_env.rendering.tissue import SECTION_SPLITS, most_tets_cut
 from surgsim_env.rendering.vessels import TEXTURE_SIZE, texture_places
@@ -60,7 +61,9 @@ BACKGROUND_COLOUR = (0.045, 0.105, 0.120)
 # Half the drape's width in radii of the organ, and its distance below the organ [m].
 DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
-# Name of the texture of vessels, white until a look draws them.
+# Tissue on which fields are painted, and the colour that multiplies theirs: the lights add up to more than 1.
+PAINTED, PAINTED_COLOUR = ("organ", "held", "section", "section_lesion"), (0.78, 0.78, 0.78)
+# Name of the texture of vessels or a field, white until a look draws them.
 VESSELS = "vessels"
 # Clipping planes of the cameras [m].
 NEAR, FAR = 0.005, 5.0
@@ -89,6 +92,10 @@ class DrawnMesh:
         first = model.mesh_faceadr[mesh]
         for array in (model.mesh_face, model.mesh_facenormal):
             array[first : first + len(shape.faces)] = shape.faces
+        if shape.shares is not None:
+            # The second half of the texture leads back.
+            first_place = model.mesh_texcoordadr[mesh]
+            model.mesh_texcoord[first_place : first_place + count, 0] = 0.5 * shape.shares
         if shape.face_places is not None:
             model.mesh_facetexcoord[first : first + len(shape.faces)] = shape.face_places
         self._face_count = len(shape.faces)
@@ -149,16 +156,37 @@ def build_scene(
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
+    if options.paint is not None:
+        # Room for a place of each vertex on the scale, in all shapes.
+        places = np.zeros((max(room[0] for room in meshes.values()), 2), dtype=np.float32)
     vessels = spec.add_texture(name=VESSELS, type=mujoco.mjtTexture.mjTEXTURE_2D, width=TEXTURE_SIZE)
     vessels.height, vessels.builtin = TEXTURE_SIZE, mujoco.mjtBuiltin.mjBUILTIN_FLAT
     vessels.rgb1 = vessels.rgb2 = [1.0, 1.0, 1.0]
     for name, (vertices, faces) in meshes.items():
         whole = name in ("organ", "held")
         opacity = TRANSLUCENT if options.show_lesion and whole else 1.0
-        add_tissue(spec, name, vertices, faces, opacity, places if whole else None)
+        textured = whole or options.paint is not None
+        add_tissue(spec, name, vertices, faces, opacity, places if textured else None)
     add_instrument(spec, instrument)
     model, data, drawn = compile_scene(spec, meshes)
-    return SceneModel(model, data, drawn, find_instrument(model, instrument), light, ground, anatomy.downward)
+    geoms = find_instrument(model, instrument)
+    if options.paint is not None:
+        _paint(model, geoms)
+    return SceneModel(model, data, drawn, geoms, light, ground, anatomy.downward)
+
+
+def _paint(model: mujoco.MjModel, instrument: InstrumentGeoms) -> None:
+    """Give tissue the colours of a scale as a texture; the instrument before it becomes translucent."""
+    texture, there = model.texture(VESSELS), field_colours(TEXTURE_SIZE // 2)
+    # There and back, since textures repeat.
+    rows = np.tile(np.concatenate([there, there[::-1]]), (TEXTURE_SIZE, 1))
+    model.tex_data[texture.adr[0] :][: rows.size] = rows.ravel()
+    for name in PAINTED:
+        material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, name)
+        if material >= 0:
+            model.mat_rgba[material, :3] = PAINTED_COLOUR
+            model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.id
+    model.geom_rgba[instrument.target, 3] = TRANSLUCENT
 
 
 def empty_scene(width: int, height: int, background: Colour, *, samples: int = 4, far: float = FAR) -> mujoco.MjSpec:

@@ -139,7 +139,7 @@ class Stage:
         self.surface = boundary_surface(anatomy, most) if options.cut_away else organ_surface(anatomy, most)
         self.scene = build_scene(anatomy, self.surface, instrument, options)
         self.canvas = Canvas(self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1)
-        self._look = DrawnLook(self.scene, self.canvas.context, has_vessels=not options.cut_away)
+        self._look = DrawnLook(self.scene, self.canvas.context, options)
         # Labels of geoms beyond the model's, by their numbers in the picture.
         self._added: dict[int, int] = {}
 

@@ -30,12 +30,14 @@ class Shape:
         normals: unit, outward                                                      (n_vertex, 3)
         faces: vertices of the triangles, outward                                   (n_face, 3)
         face_places: places of their corners on a texture; None without one         (n_face, 3)
+        shares: places on the scale of a painted field, 0 to 1; None without one    (n_vertex,)
     """
 
     vertices: FloatArray
     normals: FloatArray
     faces: IntArray
     face_places: IntArray | None = None
+    shares: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

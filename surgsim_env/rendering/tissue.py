@@ -58,6 +58,13 @@ class Tissue:
             return {name: Shape(vertices, normals, faces, places[name]) for name, faces in self._faces.items()}
         return self._cut.surfaces(vertices, normals) | self._cut.sections(node_position)
 
+    def vertex_values(self, node_values: FloatArray) -> dict[str, FloatArray]:
+        """Values at the vertices of each of the `shapes` (n_vertex,) of those at the nodes (n_node,)."""
+        values = self._surface.interpolate(node_values)
+        if self._cut is None:
+            return dict.fromkeys(self._faces, values)
+        return self._cut.vertex_values(values, node_values)
+
     def lesion_ellipsoids(self, node_position: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Current centre [m] (3,) and half axes [m] (3,) of each lesion."""
         return [(lesion.centre_now(self._rest, node_position), lesion.half_axes) for lesion in self.lesions]
@@ -94,6 +101,11 @@ class _CutAway:
             turned = mix @ normals
             shapes[name] = Shape(mix @ vertices, turned / np.linalg.norm(turned, axis=1, keepdims=True), faces)
         return shapes
+
+    def vertex_values(self, values: FloatArray, node_values: FloatArray) -> dict[str, FloatArray]:
+        """Values at the vertices of both, of those at the drawn surface's vertices and at the nodes."""
+        surfaces = {name: mix @ values for name, (mix, _) in self._surfaces.items()}
+        return surfaces | {name: mix @ node_values for name, (mix, _) in self._sections.items()}
 
     def sections(self, node_position: FloatArray) -> dict[str, Shape]:
         """Cut faces of healthy tissue and of lesions."""

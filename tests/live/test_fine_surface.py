@@ -1,11 +1,12 @@
 """The page's organ with a scan's own surface: what is sent to a browser, and the paint on it. No browser is needed."""
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from surgsim_apps.live.stage import SCALE, FeltMap, OrganView
+from surgsim_apps.live.stage import NOTHING, SCALE, FeltMap, OrganView, paint_colours
 from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
 from surgsim_env.scene.anatomy import load_anatomy
 
@@ -62,3 +63,19 @@ def test_touches_paint_it_where_they_were_felt_and_nowhere_else(anatomy, view):
     nodes = anatomy.mesh.points[felt.nodes[felt.felt]]
     reach = np.linalg.norm(nodes - top, axis=1).max()
     assert np.linalg.norm(painted - top, axis=1).max() < reach + 0.001
+
+
+def test_a_field_covers_the_whole_organ_in_the_colours_of_its_values(anatomy, view):
+    organ, sent = view
+    height = anatomy.mesh.points[:, 2]
+    organ.show_paint("stress")
+    organ.paint_field((height - height.min()) / np.ptp(height))
+    organ.follow(anatomy.mesh.points)
+    painted = [mesh for name, mesh in sent.meshes.items() if name.startswith("/felt")]
+    assert sum(len(mesh.faces) for mesh in painted) == len(sent.meshes["/organ"].faces)
+    middles = [(mesh.color, mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)) for mesh in painted]
+    colours = paint_colours("stress")
+    for (low_colour, low), (high_colour, high) in itertools.pairwise(sorted(middles, key=lambda row: row[1].mean())):
+        assert low.max() < high.min() + 1e-6 and colours.index(low_colour) < colours.index(high_colour)
+    organ.show_paint(NOTHING)
+    assert not any(mesh.visible for mesh in painted)

@@ -10,6 +10,8 @@ from surgsim_apps.live import panel as module
 from surgsim_apps.live.exchange_records import Phase, new_exchange
 from surgsim_apps.live.organ_choice import HIDDEN
 from surgsim_apps.live.panel import PLOT_LEAST, PLOTTED, Panel
+from surgsim_apps.live.stage import NOTHING, STIFFNESS_MAP
+from surgsim_env.rendering.painted_fields import PAINTED_FIELDS
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.motions import with_motion
 
@@ -19,7 +21,6 @@ SWITCHES = {
     "Hold the breath": "hold_breath",
     "Plain light": "plain",
     "Show lesions": "show_lesions",
-    "Paint it on the organ": "paint",
 }
 
 
@@ -81,9 +82,8 @@ class Gui:
 def made(scene, *, arm_count=1, has_jaw=False):
     """A panel, its gui, and the calls that were made."""
     gui, made_calls = Gui(), []
-    calls = {
-        name: lambda *given, name=name: made_calls.append((name, *given)) for name in {**BUTTONS, **SWITCHES}.values()
-    }
+    names = (*BUTTONS.values(), *SWITCHES.values(), "paint")
+    calls = {name: lambda *given, name=name: made_calls.append((name, *given)) for name in names}
     return Panel(gui, scene, arm_count, has_jaw, calls), gui, made_calls
 
 
@@ -130,6 +130,22 @@ def test_each_element_has_its_call():
     assert calls == [*((call,) for call in BUTTONS.values()), *((call, True) for call in SWITCHES.values())]
 
 
+def test_the_paint_is_chosen_by_its_title_and_has_the_end_of_its_scale():
+    panel, gui, calls = made(make_scene("phantom_small"))
+    paint, legend = gui.elements["Paint"], next(text for text in gui.texts if "lower quartile" in text.content)
+    for name, field in PAINTED_FIELDS.items():
+        paint.set(field.title)
+        assert calls.pop() == ("paint", name)
+        panel.show_legend(name, 7.25)
+        assert f"7.25 {field.unit}" in legend.content and not gui.elements["Clear"].visible
+    paint.set("none")
+    assert calls.pop() == ("paint", NOTHING)
+    panel.show_legend(NOTHING, 0.0)
+    assert not legend.visible
+    panel.show_legend(STIFFNESS_MAP, 0.0)
+    assert legend.visible and gui.elements["Clear"].visible
+
+
 def test_only_what_there_is_can_be_switched():
     for scene in (make_scene("phantom_small"), with_motion(make_scene("phantom_small"), "calm")):
         for has_jaw in (False, True):
@@ -141,7 +157,7 @@ def test_only_what_there_is_can_be_switched():
 def test_buttons_are_named_by_what_a_click_does():
     panel, gui, _ = made(make_scene("phantom_small"))
     pause, record = (gui.elements[name] for name in ("Pause", "Record"))
-    frame = new_exchange(1, 4, 1).frame.read()
+    frame = new_exchange(1, 4, 1, {}).frame.read()
     for phase, recording, names in (
         (Phase.RUNNING, False, ("Pause", "Record")),
         (Phase.PAUSED, False, ("Continue", "Record")),
@@ -161,7 +177,7 @@ def test_buttons_are_named_by_what_a_click_does():
 
 def test_plots_show_the_last_seconds_of_each_arm():
     panel, gui, _ = made(make_scene("phantom_small"), arm_count=2)
-    trace = np.zeros(2000, dtype=new_exchange(2, 4, 1).trace.read()["row"].dtype)
+    trace = np.zeros(2000, dtype=new_exchange(2, 4, 1, {}).trace.read()["row"].dtype)
     trace["time"] = 0.01 * np.arange(len(trace))
     trace["force"][:, 0, 2], trace["force"][:, 1, 0] = 0.3, -0.7
     trace["depth"][:, 0] = 0.001

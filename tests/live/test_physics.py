@@ -1,6 +1,7 @@
 """The physics' side of a session, step by step in this process: what hands do, requests, recordings, faults."""
 
 import multiprocessing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,9 +25,11 @@ from surgsim_apps.live.organ_choice import (
     chosen_organ,
     lesion_kinds,
 )
+from surgsim_apps.live.painted_tissue import PaintedTissue
 from surgsim_apps.live.physics import Physics
 from surgsim_apps.live.stage import COLOURS, FeltMap, colour_levels
 from surgsim_env.coupling.simulation import Simulation
+from surgsim_env.rendering.painted_fields import PAINTED_FIELDS
 from surgsim_env.rendering.scene_model import shown_geoms
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
@@ -42,8 +45,9 @@ class Bench:
     def __init__(self, scene: Scene | None = None) -> None:
         self.anatomy = on_a_fast_machine(scene or make_scene("phantom_small"))
         self.scene = self.anatomy.scene
-        geoms = shown_geoms(Simulation(self.anatomy).instrument.model)
-        self.exchange = new_exchange(1, self.anatomy.mesh.node_count, len(geoms))
+        simulation = Simulation(self.anatomy)
+        geoms = shown_geoms(simulation.instrument.model)
+        self.exchange = new_exchange(1, self.anatomy.mesh.node_count, len(geoms), simulation.get_state())
         self.pipe, child = multiprocessing.Pipe()
         self.kind = lesion_kinds(self.scene)[0]
         self.physics = Physics(self.anatomy, OrganChoice(lesions=self.kind), PaceSettings(), self.exchange, child)
@@ -148,6 +152,39 @@ def test_sliders_make_another_organ(bench):
     # A coupling lies between hand and tip, so that twice the stiffness is a little less than twice the force.
     assert 1.6 < forces[1] / forces[0] < 2.0
     assert bench.frame["organ"] == 3
+
+
+def test_the_page_computes_the_fields_of_the_physics(bench):
+    choices = [OrganChoice(lesions=bench.kind)]
+    session = SimpleNamespace(
+        anatomy=bench.anatomy,
+        simulation=Simulation(bench.anatomy),
+        exchange=bench.exchange,
+        choices=choices,
+        ask=bench.ask,
+    )
+    tissue = PaintedTissue(session)
+    bench.step(400, bench.above)
+    assert tissue.shares() is None and not bench.exchange.tissue.read()["organ"]
+    tissue.choose("pressure")
+    assert not tissue.shares().any() and tissue.shares() is None
+    # A refused organ keeps the number of the one before; the next one has the number of its own choice.
+    for choice in (OrganChoice(lesions=HIDDEN, lesion_ratio=1e6), OrganChoice(modulus_factor=2.0, lesions=NONE)):
+        choices.append(choice)
+        bench.ask(Change(choice))
+    bench.step(400, bench.above)
+    bench.step(1000, bench.pressed)
+    shares, simulation = tissue.shares(), bench.physics._simulation
+    field = PAINTED_FIELDS["pressure"]
+    values = field.node_values(simulation.organ_model, simulation.fields())
+    # Restored shapes are those of the next step, micrometres from the last substep's.
+    np.testing.assert_allclose(shares * tissue.end, values, rtol=0, atol=0.01 * values.max())
+    assert shares.max() == 1.0 and tissue.end == pytest.approx(values.max(), rel=0.01)
+    bench.step(600, bench.above)
+    before = tissue.end
+    assert not tissue.shares().any() and tissue.end == before
+    bench.ask(Reset())
+    assert not tissue.shares().any() and tissue.end < before
 
 
 def test_an_organ_that_cannot_be_is_refused_and_the_last_one_stays(bench):

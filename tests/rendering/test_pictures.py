@@ -196,3 +196,19 @@ def test_renderers_share_their_meshes_and_give_them_back(make_press, draw):
     renderers.clear()
     del frames
     draw(presses[0]).close()
+
+
+@pytest.mark.parametrize("cut_away", [False, True])
+def test_a_field_is_painted_where_it_is(press, draw, cut_away):
+    """The organ is purple far from the tip, green below it; the picture without the option stays as it was."""
+    press.press(0.006)
+    plain = draw(press, cut_away=cut_away).rgb()
+    renderer = draw(press, paint="stress", show_force=False, cut_away=cut_away)
+    frame, labels = renderer.rgb().astype(int), renderer.segmentation()
+    # Viridis begins with purple, and has more green than red from a fifth of its scale on.
+    rows, columns = np.nonzero((labels == ORGAN) & (frame[..., 1] > frame[..., 0]))
+    assert 0 < len(rows) < 0.2 * (labels == ORGAN).sum()
+    (place,), _ = renderer.cameras["overview"].project(press.simulation.contact_centre[None], 640, 480)
+    # Within a radius of the ball, 50 to 60 pixels, around and below the contact.
+    assert np.linalg.norm(np.median([columns, rows], axis=1) - place) < 60.0
+    np.testing.assert_array_equal(draw(press, cut_away=cut_away).rgb(), plain)

@@ -140,12 +140,13 @@ def hand_type(arm_count: int) -> np.dtype:
     return np.dtype([("target", "f8", (arm_count, 3)), ("buttons", "i8", (arm_count,)), ("beat", "i8")])
 
 
-def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
+def frame_type(arm_count: int, node_count: int, geom_count: int, taxels: tuple[int, ...]) -> np.dtype:
     """Physics to page, some 60 times a second.
 
     phase, organ (1, and 1 more for each Change up to its own), recording, the number of recordings begun, True for a
     held breath, time [s] since the reset, a message (a fault or a refusal), added_mass [kg]; for each arm its tip [m]
-    and the force of tissue on it [N]; nodes [m]; positions [m] and rotations of geoms.
+    and the force of tissue on it [N]; nodes [m]; positions [m] and rotations of geoms; normal force on each taxel [N],
+    (n_patch, rows, columns).
     """
     arms = (arm_count, 3)
     return np.dtype(
@@ -153,7 +154,7 @@ def frame_type(arm_count: int, node_count: int, geom_count: int) -> np.dtype:
             ("phase", "i4"), ("organ", "i8"), ("recording", "?"), ("recordings", "i8"),
             ("breath_held", "?"), ("time", "f8"), ("message", f"S{TEXT_MOST}"), ("added_mass", "f8"),
             ("tip", "f8", arms), ("force", "f8", arms), ("node", "f4", (node_count, 3)),
-            ("geom", "f4", (geom_count, 3)), ("turn", "f4", (geom_count, 9)),
+            ("geom", "f4", (geom_count, 3)), ("turn", "f4", (geom_count, 9)), ("taxel", "f4", taxels),
         ]
     )  # fmt: skip
 
@@ -240,11 +241,17 @@ class Exchange:
     recorded: RecordedSteps
 
 
-def new_exchange(arm_count: int, node_count: int, geom_count: int, state: Mapping[str, NDArray[Any]]) -> Exchange:
-    """Allocate the memory of one session; `state` is one of its simulation."""
+def new_exchange(
+    arm_count: int,
+    node_count: int,
+    geom_count: int,
+    state: Mapping[str, NDArray[Any]],
+    taxels: tuple[int, ...] = (0, 0, 0),
+) -> Exchange:
+    """Allocate the memory of one session; `state` is one of its simulation, `taxels` patches, rows and columns."""
     return Exchange(
         hand=SharedRecord(hand_type(arm_count)),
-        frame=SharedRecord(frame_type(arm_count, node_count, geom_count)),
+        frame=SharedRecord(frame_type(arm_count, node_count, geom_count, taxels)),
         tissue=SharedRecord(tissue_type(state)),
         trace=SharedRecord(trace_type(arm_count)),
         timing=SharedRecord(TIMING),

@@ -171,6 +171,8 @@ class Page:
                     if now >= plot_due:
                         plot_due = now + PLOT_PERIOD
                         self._panel.plot(self.session.trace())
+                        if frame["taxel"].size:
+                            self._panel.show_taxels(frame["taxel"])
                 self.pictures += 1
             if now >= status_due:
                 status_due = now + STATUS_PERIOD

@@ -12,13 +12,15 @@ from surgsim_apps.haptics.pacing import Timeliness
 from surgsim_apps.live.exchange_records import Phase
 from surgsim_apps.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_apps.live.stage import CONTRASTS, NOTHING, STIFFNESS_MAP, paint_colours
-from surgsim_env.rendering import PAINTED_FIELDS
+from surgsim_env.rendering import PAINTED_FIELDS, field_colours
 from surgsim_env.scene import Scene
 
 # Time span of the plots [s], and their number of points.
 PLOTTED, PLOT_POINTS = 10.0, 250
 # Smallest upper end of a plot's scale; it doubles as needed.
 PLOT_LEAST = {"N": 0.5, "mm": 4.0}
+# Least end of the colours of taxels [N].
+TAXEL_LEAST = 0.01
 # Time without a motion of the sliders before a change applies [s].
 SETTLED = 0.35
 # Choices of the paint, with their names.
@@ -85,6 +87,7 @@ class Panel:
         with gui.add_folder("Force and depth"):
             self._force = _plot(gui, "N", arm_count)
             self._depth = _plot(gui, "mm", arm_count)
+        self._taxels = gui.add_html("", visible=False)
         with gui.add_folder("Tissue"):
             self._add_tissue()
         with gui.add_folder("Colours"):
@@ -126,6 +129,11 @@ class Panel:
         _set(self._legend, "content", _legend_html(kind, end))
         _set(self._legend, "visible", kind != NOTHING)
         _set(self._clear, "visible", kind == STIFFNESS_MAP)
+
+    def show_taxels(self, normal: NDArray[np.float32]) -> None:
+        """Show the normal force on each taxel of patches side by side [N], (n_patch, rows, columns)."""
+        self._taxels.content = _taxels_html(normal)
+        _set(self._taxels, "visible", True)
 
     def plot(self, trace: np.ndarray) -> None:
         """Show a trace's rows: time [s], force [N] and depth [m] of each arm."""
@@ -245,6 +253,24 @@ def _status_html(headline: str, rows: list[tuple[str, str]]) -> str:
     return (
         f'<div style="padding:.2em .9em .5em;font-size:.85em"><b>{headline}</b>'
         f'<table style="width:100%;border-spacing:0">{cells}</table></div>'
+    )
+
+
+def _taxels_html(normal: NDArray[np.float32]) -> str:
+    colours, most = field_colours(256), float(normal.max())
+    patches = []
+    for patch in normal:
+        places = np.clip(255.0 * patch / max(most, TAXEL_LEAST), 0.0, 255.0).astype(int)
+        # The first row is at the bottom, as seen along the patch's own axes.
+        cells = "".join(
+            f'<i style="background:rgb{tuple(map(int, colours[place]))}"></i>' for place in places[::-1].flat
+        )
+        rows, width = patch.shape
+        columns = f"grid-template-columns:repeat({width},1fr);aspect-ratio:{width}/{rows}"
+        patches.append(f'<div style="display:grid;gap:1px;flex:1;max-width:9em;{columns}">{cells}</div>')
+    return (
+        '<div style="padding:.2em .9em;font-size:.8em">'
+        f'<div style="display:flex;gap:.6em">{"".join(patches)}</div>taxels: up to {1e3 * most:.0f} mN</div>'
     )
 
 

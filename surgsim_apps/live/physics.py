@@ -291,6 +291,8 @@ class Physics:
                 frame["tip"][arm] = self._loop.held[arm].drive.tool.tip_position
                 frame["force"][arm] = tip.contact_force
             frame["node"] = simulation.organ_state.node_position[:, :3]
+            if simulation.taxels is not None:
+                frame["taxel"] = simulation.taxels[..., 2]
             frame["geom"], frame["turn"] = data.geom_xpos[self._geoms], data.geom_xmat[self._geoms]
         if self._paints:
             with self._exchange.tissue.writing() as tissue:

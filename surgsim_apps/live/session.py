@@ -73,7 +73,11 @@ class Session:
         self.directions = np.eye(3)
         self.geoms = shown_geoms(self.instrument.model)
         self.exchange: Exchange = new_exchange(
-            len(self.parked), self.anatomy.mesh.node_count, len(self.geoms), self.simulation.get_state()
+            len(self.parked),
+            self.anatomy.mesh.node_count,
+            len(self.geoms),
+            self.simulation.get_state(),
+            self.instrument.taxel_shape[:3],
         )
         self._targets = self.parked.copy()
         self._buttons = np.zeros(len(self.parked), dtype=np.int64)

@@ -1,5 +1,6 @@
 """Contents of the panel and calls of its elements, with a gui that keeps its elements by label."""
 
+import re
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ from surgsim_apps.live.exchange_records import Phase, new_exchange
 from surgsim_apps.live.organ_choice import HIDDEN
 from surgsim_apps.live.panel import PLOT_LEAST, PLOTTED, Panel
 from surgsim_apps.live.stage import NOTHING, STIFFNESS_MAP
-from surgsim_env.rendering.painted_fields import PAINTED_FIELDS
+from surgsim_env.rendering.painted_fields import PAINTED_FIELDS, field_colours
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.motions import with_motion
 
@@ -69,8 +70,8 @@ class Gui:
         self.plots[series[1]["label"].rpartition("[")[2].rstrip("]")] = plot
         return plot
 
-    def add_html(self, content):
-        self.texts.append(Element(content=content))
+    def add_html(self, content, **look):
+        self.texts.append(Element(content=content, **look))
         return self.texts[-1]
 
     add_markdown = add_html
@@ -187,3 +188,14 @@ def test_plots_show_the_last_seconds_of_each_arm():
     assert np.allclose(left, 0.3) and np.allclose(right, 0.7)
     assert gui.plots["N"].scales["y"]["max"] == 2.0 * PLOT_LEAST["N"]
     assert np.allclose(gui.plots["mm"].data[1], 1.0) and gui.plots["mm"].scales["y"]["max"] == PLOT_LEAST["mm"]
+
+
+def test_taxels_are_coloured_by_their_force_from_the_bottom_row_up():
+    panel, gui, _ = made(make_scene("phantom_small"))
+    normal = np.zeros((1, 2, 3), dtype=np.float32)
+    normal[0, 0, 2] = 0.05
+    panel.show_taxels(normal)
+    (shown,) = [text for text in gui.texts if "taxels" in text.content]
+    cells = re.findall(r"rgb\((\d+, \d+, \d+)\)", shown.content)
+    low, high = (", ".join(map(str, colour.tolist())) for colour in field_colours(256)[[0, -1]])
+    assert shown.visible and cells == [low] * 5 + [high] and "up to 50 mN" in shown.content

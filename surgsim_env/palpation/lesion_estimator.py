@@ -22,10 +22,11 @@ EXCESS_LENGTH = 0.010
 # Deviation of healthy presses beside the sensor's noise: a capsule absent from the map, the mesh.
 MODEL_SPREAD = 0.05
 # Deviation of the gradient of healthy presses about the map of a curved organ [1/m]: the mesh moves the centre of
-# pressure within a cell. On `liver_family` 6 with lesions of 16.5 mm.
-ORGAN_GRADIENT_SPREAD = 12.0
+# pressure within a cell. On `liver_family` 12, for lesions of 8 mm; a little more keeps errors of neighbouring presses,
+# which are alike, from adding up to false lesions.
+ORGAN_GRADIENT_SPREAD = 15.0
 # Deviation of the gradient by taxels beside their noise [1/m]: bells that are not the process', the mesh.
-GRADIENT_SPREAD = 8.0
+GRADIENT_SPREAD = 14.0
 # Deviation of healthy presses about the map of a curved organ: capsules and moduli absent from the map show where the
 # tissue is thinner, and a member's map has errors. On the training split of `liver_family` 0.009 to 0.032; more
 # costs nothing there, less adds false lesions (docs/palpation.md). On blocks, with flat faces, 0.007 to 0.016,
@@ -34,6 +35,8 @@ ORGAN_MAP_SPREAD = 0.035
 # A lesion is a maximum of the excess above the first of these plus the second times the sensor's noise plus the third
 # times the map's deviation,
 EXCESS_LEAST, EXCESS_LEAST_NOISE, EXCESS_LEAST_MAP = 0.07, 0.75, 2.0
+# with gradients this more,
+EXCESS_LEAST_GRADIENT = 0.03
 # at least this far [m] from a stronger one,
 DISTANCE_LEAST = 0.012
 # placed at the centroid of the excess within this [m] of it,
@@ -211,6 +214,8 @@ class LesionEstimator:
         self.lesion_radius, self.noise, self.gradient_noise = lesion_radius, noise, gradient_noise
         self.scale = lesion_radius / REFERENCE_LESION_RADIUS
         self.excess_least = EXCESS_LEAST + EXCESS_LEAST_NOISE * noise + EXCESS_LEAST_MAP * map_spread
+        if gradient_noise:
+            self.excess_least += EXCESS_LEAST_GRADIENT
         # Coordinates of the map's points along each axis [m], from edge to edge.
         spacing = MAP_SPACING * self.scale
         first, second = (np.linspace(0.0, side, max(2, round(side / spacing) + 1)) for side in self.extent)

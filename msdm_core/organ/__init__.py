@@ -1,7 +1,7 @@
 """Organs: compilation, supports and foundations, stable step, integration, measured quantities."""
 
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
-from msdm_core.organ.field_series import FieldSeries, frame_name
+from msdm_core.organ.field_series import FieldSeries
 from msdm_core.organ.fields import TissueFields, contact_points, tissue_fields
 from msdm_core.organ.measure import (
     contact_energy,
@@ -52,7 +52,6 @@ __all__ = [
     "element_size",
     "element_stiffness",
     "element_strains",
-    "frame_name",
     "kinetic_energy",
     "node_strains",
     "potential_energy",

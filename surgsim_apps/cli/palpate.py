@@ -17,7 +17,7 @@ from surgsim_apps.cli.values import (
     shown_path,
     vector_of,
 )
-from surgsim_apps.palpate.field_press import FIELDS_NAME, field_names, record_press, write_fields_picture
+from surgsim_apps.palpate.field_press import FIELDS_NAME, SERIES_NAME, record_press
 from surgsim_apps.palpate.figures import write_organ_picture, write_stiffness_map
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, load_stable_anatomy, run_palpation
 from surgsim_apps.palpate.report import print_report, write_report
@@ -93,10 +93,9 @@ class Palpate:
         _check(self)
         around, lesion_options, below = _around(self), _asked_lesions(self), _asked_below(self)
         scene = with_options(make_scene(self.scene), self.options)
-        names = (REPORT_NAME, CSV_NAME, SUMMARY_NAME, PICTURE_NAME, ORGAN_NAME)
-        series = field_names(scene)
+        names = (REPORT_NAME, CSV_NAME, SUMMARY_NAME, PICTURE_NAME, ORGAN_NAME, FIELDS_NAME, SERIES_NAME)
         default = Path("runs") / f"palpate-{scene.name}"
-        with output_folder(self.out or default, (*names, FIELDS_NAME, *series), numbered=self.out is None) as files:
+        with output_folder(self.out or default, names, numbered=self.out is None) as files:
             with StepProgress(console) as progress:
                 with progress.step("preparing the organ"):
                     anatomy = load_anatomy(scene)
@@ -109,20 +108,21 @@ class Palpate:
                             anatomy.check_inside(lesion)
                     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
                 palpation = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, progress=progress)
-                pressed = record_press(palpation, files / series[0], progress) if self.fields else None
+                if self.fields:
+                    record_press(palpation, files / SERIES_NAME, files / FIELDS_NAME, progress)
                 with progress.step("drawing the maps"):
                     write_csv(palpation, files / CSV_NAME)
                     write_summary(palpation, files / SUMMARY_NAME, vars(self))
                     write_stiffness_map(palpation, files / PICTURE_NAME)
                     write_organ_picture(palpation, files / ORGAN_NAME)
-                    if pressed is not None:
-                        write_fields_picture(pressed, scene, files / FIELDS_NAME)
-                    pictures = {"maps": files / PICTURE_NAME, "organ": files / ORGAN_NAME}
-                    fields = files / FIELDS_NAME if self.fields else None
-                    report = files / REPORT_NAME
-                    write_report(palpation, report, **pictures, fields=fields, command=self.command_line)
+                    pictures = {
+                        "maps": files / PICTURE_NAME,
+                        "organ": files / ORGAN_NAME,
+                        "fields": files / FIELDS_NAME,
+                    }
+                    write_report(palpation, files / REPORT_NAME, **pictures, command=self.command_line)
         print_report(palpation, console)
-        written = [*names, FIELDS_NAME, series[0]] if self.fields else names
+        written = [name for name in names if (files.path / name).exists()]
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0
 

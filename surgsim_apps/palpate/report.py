@@ -53,7 +53,7 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
 
 
 def write_report(
-    palpation: PalpationResult, path: Path, *, maps: Path, organ: Path, fields: Path | None, command: str
+    palpation: PalpationResult, path: Path, *, maps: Path, organ: Path, fields: Path, command: str
 ) -> None:
     """Write the report page.
 
@@ -62,7 +62,7 @@ def write_report(
         path: of the page.
         maps: PNG file of `write_stiffness_map`.
         organ: PNG file of `write_organ_picture`.
-        fields: PNG file of `write_fields_picture`; None for a palpation without.
+        fields: PNG file of `record_press`, if it was written.
         command: the command line that repeats this report.
     """
     scene, entries = palpation.anatomy.scene, palpation.maps[::-1]
@@ -76,8 +76,8 @@ def write_report(
         "the strongest contrast."
     )
     fields_caption = (
-        "The organ around the site over the first lesion, or the first site, at the end of a press and seen along it; "
-        "means at nodes, over about a cell."
+        "The surface below the tip (dashed) at the end of a press over the first lesion, or at the first site: the "
+        "pressure of each triangle, and means at nodes, over about a cell."
     )
     page = render_page(
         "palpate.html.j2",
@@ -92,7 +92,7 @@ def write_report(
         ],
         map_picture=Picture.of_file(maps, "Stiffness, and force over depth", map_caption),
         organ_picture=Picture.of_file(organ, "The organ with the probe", organ_caption),
-        fields_picture=None if fields is None else Picture.of_file(fields, "Fields of a press", fields_caption),
+        fields_picture=Picture.of_file(fields, "Fields of a press", fields_caption) if fields.exists() else None,
         settings=_settings(palpation),
         command=command,
     )

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.arithmetic import dot, log, matmul, norm
+from msdm_core.arithmetic import dot, eigh, log, matmul, norm
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
     QUADRATURE_COUNT,
@@ -252,7 +252,9 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
         node_strain = node_strains(model, element_strains(model, state.node_position))
         equivalent = float(node_strain[model.node_excess > 0.0].max())
     place, most = int(pressure.argmax()), int(strain.argmax())
-    return TissueLoad(float(pressure[place]), place, float(strain[most]), most, equivalent)
+    # To rounding, also where two principal values are close.
+    largest = np.abs(np.sqrt(np.maximum(eigh(squared[[most]])[0], 0.0)) - 1.0).max()
+    return TissueLoad(float(pressure[place]), place, float(largest), most, equivalent)
 
 
 def principal_values(matrices: FloatArray) -> FloatArray:

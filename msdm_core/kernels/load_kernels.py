@@ -25,6 +25,7 @@ from msdm_core.kernels.space_kernels import (
     edge,
     length_of,
     minus,
+    plus,
     row_of,
     scalar_product,
     set_row,
@@ -105,14 +106,40 @@ def fill_squared_stretches(rest, position, tets, squared):
     """F^T F of each tet, with its deformation gradient F = dx/dX.
 
     In:  rest, position: of the nodes [m] (n_node, 3), tets (n_tet, 4)
-    Out: squared (n_tet, 3, 3)
+    Out: squared (3, 3, n_tet), row by row at and above the diagonal
     """
     for tet in range(tets.shape[0]):
         x, y, z, volume = _volume_gradient(rest, position, tets, tet)
-        x, y, z = divided(x, volume), divided(y, volume), divided(z, volume)
+        share = 1.0 / (volume * volume)
         for row in range(3):
             part = shifted(shifted(times(x[row], x), y[row], y), z[row], z)
-            set_row(squared[tet], row, 0, part)
+            for column in range(row, 3):
+                squared[row, column, tet] = share * part[column]
+
+
+@njit(**KERNEL)
+def fill_lengths(position, springs, length):
+    """Distance of the ends of each spring: position (n_node, 3), springs (n_spring, 2); out: length (n_spring,)."""
+    for spring in range(springs.shape[0]):
+        length[spring] = length_of(edge(position, springs[spring, 0], springs[spring, 1]))
+
+
+@njit(**KERNEL)
+def add_to_corners(nodes, value, total):
+    """Value of each item added to each of its nodes: nodes (n, m), value (n,), total (n_node,)."""
+    for item in range(nodes.shape[0]):
+        for corner in range(nodes.shape[1]):
+            total[nodes[item, corner]] += value[item]
+
+
+@njit(**KERNEL)
+def fill_corner_means(nodes, value, mean):
+    """Mean of a value of the nodes (n_node,) over the nodes (n, m) of each item; out: mean (n,)."""
+    for item in range(nodes.shape[0]):
+        total = value[nodes[item, 0]]
+        for corner in range(1, nodes.shape[1]):
+            total += value[nodes[item, corner]]
+        mean[item] = total / nodes.shape[1]
 
 
 @njit(**KERNEL)
@@ -140,20 +167,38 @@ def add_tet_stresses(tets, quarter, pull, spring_stress, virial):
     """
     for tet in range(tets.shape[0]):
         a, b, c, d = tets[tet, 0], tets[tet, 1], tets[tet, 2], tets[tet, 3]
-        mean = 0.25 * quarter[tet]
-        for row in range(3):
-            for column in range(row, 3):
-                part = spring_stress[a, row, column] + spring_stress[b, row, column]
-                part += spring_stress[c, row, column] + spring_stress[d, row, column]
-                part *= mean
-                if row == column:
-                    part += quarter[tet] * pull[tet]
-                for corner in range(4):
-                    virial[tets[tet, corner], row, column] += part
-    for node in range(virial.shape[0]):
-        for row in range(3):
-            for column in range(row):
-                virial[node, row, column] = virial[node, column, row]
+        mean, own = 0.25 * quarter[tet], quarter[tet] * pull[tet]
+        x = _corner_sum(spring_stress, a, b, c, d, 0)
+        y = _corner_sum(spring_stress, a, b, c, d, 1)
+        z = _corner_sum(spring_stress, a, b, c, d, 2)
+        x, y, z = times(mean, x), times(mean, y), times(mean, z)
+        x, y, z = (x[0] + own, x[1], x[2]), (y[0], y[1] + own, y[2]), (z[0], z[1], z[2] + own)
+        for node in (a, b, c, d):
+            add_to_row(virial[node], 0, x)
+            add_to_row(virial[node], 1, y)
+            add_to_row(virial[node], 2, z)
+
+
+@njit(**INLINED)
+def _corner_sum(stress, a, b, c, d, row):
+    """Sum of one row of the stresses of four nodes."""
+    total = plus(row_of(stress[a], row), row_of(stress[b], row))
+    return plus(plus(total, row_of(stress[c], row)), row_of(stress[d], row))
+
+
+@njit(**KERNEL)
+def fill_normals(position, triangles, normal, area):
+    """Unit normal and area of each triangle.
+
+    In:  position: of the nodes [m] (n_node, 3), triangles (n, 3)
+    Out: normal (n, 3), area [m^2] (n,)
+    """
+    for triangle in range(triangles.shape[0]):
+        a, b, c = row_of(triangles, triangle)
+        across = vector_product(edge(position, a, b), edge(position, a, c))
+        twice = length_of(across)
+        set_row(normal, triangle, 0, divided(across, twice))
+        area[triangle] = 0.5 * twice
 
 
 @njit(**KERNEL)
@@ -163,33 +208,32 @@ def fill_principal_values(matrices, values):
     m is a third of the trace, 6 p^2 the square of A - m 1. The root x farthest from 0 follows by Newton's method from
     its chord over the determinant, where three rounds reach rounding; the others are those of its quadratic factor.
 
-    In:  matrices (n, 3, 3)
-    Out: values (n, 3)
+    The loop has no branch and reads each entry in a row, so that it runs in registers of several numbers.
+
+    In:  matrices (3, 3, n), read at and above the diagonal
+    Out: values (3, n)
     """
     least = math.sqrt(3.0)  # of the positive root, at a determinant of 0
-    for number in range(matrices.shape[0]):
-        a = matrices[number]
-        yz, zx, xy = a[1, 2], a[2, 0], a[0, 1]
-        mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
-        x, y, z = a[0, 0] - mean, a[1, 1] - mean, a[2, 2] - mean
+    for number in range(matrices.shape[2]):
+        yz, zx, xy = matrices[1, 2, number], matrices[0, 2, number], matrices[0, 1, number]
+        x, y, z = matrices[0, 0, number], matrices[1, 1, number], matrices[2, 2, number]
+        mean = (x + y + z) / 3.0
+        x, y, z = x - mean, y - mean, z - mean
         size = math.sqrt((0.5 * (x * x + y * y + z * z) + (yz * yz + zx * zx + xy * xy)) / 3.0)
         cube = size * size * size
-        share = 0.0
-        if cube > 0.0:
-            share = (x * (y * z - yz * yz) - xy * (xy * z - yz * zx) + zx * (xy * yz - y * zx)) / cube
+        determinant = x * (y * z - yz * yz) - xy * (xy * z - yz * zx) + zx * (xy * yz - y * zx)
+        share = determinant / (cube if cube > 0.0 else 1.0)
         twice = min(abs(share), 2.0)
         root = least + twice * (1.0 - 0.5 * least)
         for _ in range(3):
             square = root * root
             root = (2.0 * root * square + twice) / (3.0 * square - 3.0)
         apart = math.sqrt(max(3.0 * (2.0 - root) * (2.0 + root), 0.0))
-        middle = 0.5 * (apart - root)
-        lowest = -0.5 * (apart + root)
-        if share < 0.0:
-            root, middle, lowest = -lowest, -middle, -root
-        values[number, 0] = mean + size * root
-        values[number, 1] = mean + size * middle
-        values[number, 2] = mean + size * lowest
+        middle, lowest = 0.5 * (apart - root), -0.5 * (apart + root)
+        negative = share < 0.0
+        values[0, number] = mean + size * (-lowest if negative else root)
+        values[1, number] = mean + size * (-middle if negative else middle)
+        values[2, number] = mean + size * (-root if negative else lowest)
 
 
 @njit(**KERNEL)

@@ -1,6 +1,7 @@
 """Organs: compilation, supports and foundations, stable step, integration, measured quantities."""
 
 from msdm_core.organ.compile import OrganSpec, compile_organ, rest_state
+from msdm_core.organ.field_series import FieldSeries
 from msdm_core.organ.fields import TissueFields, contact_points, tissue_fields
 from msdm_core.organ.measure import (
     contact_energy,
@@ -33,6 +34,7 @@ __all__ = [
     "NO_CONTACT",
     "NO_SHAPES",
     "SIGNAL",
+    "FieldSeries",
     "OrganSpec",
     "Support",
     "SupportLaw",

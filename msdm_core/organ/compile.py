@@ -39,7 +39,7 @@ from msdm_core.mesh.ordering import spring_order
 from msdm_core.mesh.tet_mesh import FloatArray, TetMesh, area_vectors
 from msdm_core.mesh_files.mesh_file import LARGEST_EXTENT, SMALLEST_EXTENT
 from msdm_core.organ.foundation import Foundation, foundation_fields
-from msdm_core.organ.measure import element_strains, element_tensions
+from msdm_core.organ.measure import element_strains, element_tensions, node_strains
 from msdm_core.organ.motion import Motion, motion_fields
 from msdm_core.organ.stability import own_step, steep_sweeps
 from msdm_core.organ.state import blank_state
@@ -392,7 +392,8 @@ def relax_arms(model: OrganModel, state: OrganState) -> None:
     """Relax all Maxwell arms fully at the present positions, in place."""
     if not model.relaxes:
         return
-    tension = element_tensions(model, element_strains(model, state.node_position))
+    strain = element_strains(model, state.node_position)
+    tension = element_tensions(model, strain, node_strains(model, strain))
     state.element_arm_tension[:] = np.tile(tension, ARM_COUNT)
     state.element_relief[:] = (model.element_arm_modulus.reshape(ARM_COUNT, -1) * tension).sum(axis=0)
 

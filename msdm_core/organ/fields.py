@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from msdm_core.arithmetic import norm
 from msdm_core.errors import OrganDivergedError
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
@@ -31,7 +30,13 @@ from msdm_core.kernels.contact_kernels import (
     ROW_SLOPE,
     ROW_STRETCH,
 )
-from msdm_core.kernels.load_kernels import add_spring_virials, add_tet_stresses, fill_squared_stretches
+from msdm_core.kernels.load_kernels import (
+    add_spring_virials,
+    add_tet_stresses,
+    fill_normals,
+    fill_principal_values,
+    fill_squared_stretches,
+)
 from msdm_core.kernels.structure_kernels import (
     FAULT_NONE,
     KEPT_NAMES,
@@ -40,13 +45,15 @@ from msdm_core.kernels.structure_kernels import (
     OrganModel,
     OrganState,
 )
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, area_vectors
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from msdm_core.organ.measure import (
     corner_means,
+    corner_sums,
     element_energies,
     element_strains,
     element_tensions,
     node_shares,
+    node_strains,
     principal_values,
     squeezed_energies,
     squeezed_tensions,
@@ -149,17 +156,19 @@ def tissue_fields(
         OrganDivergedError: a fault in that substep.
     """
     points = contact_points(model, state, shapes, contact, dt)
-    vector = area_vectors(state.node_position.take(model.surface_triangles, axis=0))
-    area = norm(vector, axis=1)
-    push = np.stack([np.bincount(points.triangle, part, len(area)) for part in points.force.T], axis=1)
+    normal, area = np.empty((len(model.surface_triangles), 3)), np.empty(len(model.surface_triangles))
+    fill_normals(state.node_position, model.surface_triangles, normal, area)
+    push = np.zeros_like(normal)
+    np.add.at(push, points.triangle, points.force)
     strain = element_strains(model, state.node_position)
-    stress = node_stresses(model, state, strain)
-    energy = element_energies(model, strain)
+    equivalent = node_strains(model, strain)
+    stress = node_stresses(model, state, strain, equivalent)
+    energy = element_energies(model, strain, equivalent)
     first, count = len(model.spring_nodes), len(model.tet_nodes)
     energy[first : first + count] += squeezed_energies(model, strain[first : first + count] + 1.0)
     return TissueFields(
         traction=-push / area[:, None],
-        normal=vector / area[:, None],
+        normal=normal,
         area=area,
         stress=stress,
         principal_stress=principal_values(stress),
@@ -168,10 +177,10 @@ def tissue_fields(
     )
 
 
-def node_stresses(model: OrganModel, state: OrganState, strain: FloatArray) -> FloatArray:
-    """Cauchy stress at each node [Pa], (n_node, 3, 3), from the strains of elements (n_element,)."""
+def node_stresses(model: OrganModel, state: OrganState, strain: FloatArray, equivalent: FloatArray) -> FloatArray:
+    """Cauchy stress at each node [Pa], (n_node, 3, 3); other arguments as of `element_tensions`."""
     springs, tets = len(model.spring_nodes), len(model.tet_nodes)
-    tension = element_tensions(model, strain)
+    tension = element_tensions(model, strain, equivalent)
     if model.relaxes:
         tension = tension * model.element_gain - state.element_relief
     ratio, averaged = 1.0 + strain[springs : springs + tets], tension[springs + tets :]
@@ -188,12 +197,13 @@ def node_stresses(model: OrganModel, state: OrganState, strain: FloatArray) -> F
 
 def principal_stretches(model: OrganModel, state: OrganState) -> FloatArray:
     """Singular values of F = dx/dX of each tet, descending, (n_tet, 3)."""
-    squared = np.empty((len(model.tet_nodes), 3, 3))
+    squared, values = np.empty((3, 3, len(model.tet_nodes))), np.empty((3, len(model.tet_nodes)))
     fill_squared_stretches(model.node_rest_position, state.node_position, model.tet_nodes, squared)
-    return np.sqrt(np.maximum(principal_values(squared), 0.0))
+    fill_principal_values(squared, values)
+    return np.sqrt(np.maximum(values, 0.0)).T
 
 
 def _mean_around(model: OrganModel, density: FloatArray) -> FloatArray:
     """Mean of a density at nodes over the tets around each, by undeformed volume, (n_node,)."""
-    quarters = np.repeat(0.25 * model.tet_rest_volume * corner_means(density, model.tet_nodes), 4)
-    return np.bincount(model.tet_nodes.ravel(), quarters, len(density)) / model.node_rest_volume
+    quarter = 0.25 * model.tet_rest_volume * corner_means(density, model.tet_nodes)
+    return corner_sums(model, model.tet_nodes, quarter) / model.node_rest_volume

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdm_core.arithmetic import dot, log, matmul, norm
+from msdm_core.arithmetic import dot, eigh, log, matmul, norm
 from msdm_core.kernels.contact_kernels import (
     QUADRATURE_BARYCENTRIC,
     QUADRATURE_COUNT,
@@ -12,7 +12,15 @@ from msdm_core.kernels.contact_kernels import (
     QUADRATURE_WEIGHT,
 )
 from msdm_core.kernels.element_kernels import SQUEEZED_RATIO, STRAIN_LEAST
-from msdm_core.kernels.load_kernels import add_gradients, add_pressures, fill_principal_values, fill_volume_ratios
+from msdm_core.kernels.load_kernels import (
+    add_gradients,
+    add_pressures,
+    add_to_corners,
+    fill_corner_means,
+    fill_lengths,
+    fill_principal_values,
+    fill_volume_ratios,
+)
 from msdm_core.kernels.structure_kernels import ContactLaw, ContactShapes, OrganModel, OrganState
 from msdm_core.kernels.support_kernels import add_support_forces, place_ground
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray, area_vectors
@@ -34,7 +42,8 @@ def potential_energy(model: OrganModel, state: OrganState) -> float:
     u_h the displacement of a node on an elastic foundation. Contact with tools (`contact_energy`) and supports is not
     included.
     """
-    elements = float(element_energies(model, element_strains(model, state.node_position)).sum())
+    strain = element_strains(model, state.node_position)
+    elements = float(element_energies(model, strain, node_strains(model, strain)).sum())
     volume = float(squeezed_energies(model, volume_ratios(model, state)).sum())
     lift = matmul(state.node_position - model.node_rest_position, model.gravity)
     ground = (state.motion[:, SIGNAL, None, None] * model.motion_foundation_shift).sum(axis=0)
@@ -68,20 +77,11 @@ def element_strains(model: OrganModel, position: FloatArray) -> FloatArray:
         model: the organ.
         position: of the nodes [m], (n_node, 3).
     """
-    (along,) = spans(position, model.spring_nodes)
-    ratio = np.empty(len(model.tet_nodes))
+    length, ratio = np.empty(len(model.spring_nodes)), np.empty(len(model.tet_nodes))
+    fill_lengths(position, model.spring_nodes, length)
     fill_volume_ratios(position, model.tet_nodes, model.tet_rest_volume, ratio)
-    quarter = np.repeat(ratio * model.tet_rest_volume / 4.0, 4)
-    averaged = np.bincount(model.tet_nodes.ravel(), quarter, len(position)) / model.node_rest_volume
-    length = norm(along, axis=0)
+    averaged = corner_sums(model, model.tet_nodes, ratio * model.tet_rest_volume / 4.0) / model.node_rest_volume
     return np.concatenate([length / model.spring_rest_length, ratio, averaged]) - 1.0
-
-
-def spans(position: FloatArray, nodes: IntArray) -> list[FloatArray]:
-    """Vectors from the first node of each item to its others [m], (3, n) each; position (n_node, 3), nodes (n, m)."""
-    rows = np.ascontiguousarray(position.T)
-    first, *others = (rows.take(column, axis=1) for column in nodes.T)
-    return [other - first for other in others]
 
 
 def element_stiffness(model: OrganModel) -> FloatArray:
@@ -99,10 +99,17 @@ def element_size(model: OrganModel) -> FloatArray:
 
 def node_shares(model: OrganModel, energy: FloatArray) -> FloatArray:
     """Sum of the energies of elements (n_element,) at each node, an even share at each of an element's, (n_node,)."""
-    count, springs, tets = len(model.node_mass), len(model.spring_nodes), len(model.tet_nodes)
-    halves, quarters = np.repeat(0.5 * energy[:springs], 2), np.repeat(0.25 * energy[springs : springs + tets], 4)
-    total = np.bincount(model.spring_nodes.ravel(), halves, count)
-    return total + np.bincount(model.tet_nodes.ravel(), quarters, count) + energy[springs + tets :]
+    springs, tets = len(model.spring_nodes), len(model.tet_nodes)
+    total = corner_sums(model, model.spring_nodes, 0.5 * energy[:springs])
+    quarters = corner_sums(model, model.tet_nodes, 0.25 * energy[springs : springs + tets])
+    return total + quarters + energy[springs + tets :]
+
+
+def corner_sums(model: OrganModel, nodes: IntArray, value: FloatArray) -> FloatArray:
+    """Sum at each node (n_node,) of a value (n,) of the items with nodes (n, m)."""
+    total = np.zeros(len(model.node_mass))
+    add_to_corners(nodes, value, total)
+    return total
 
 
 def element_means(model: OrganModel, value: FloatArray) -> FloatArray:
@@ -112,22 +119,32 @@ def element_means(model: OrganModel, value: FloatArray) -> FloatArray:
 
 def corner_means(value: FloatArray, nodes: IntArray) -> FloatArray:
     """Mean of a value of the nodes (n_node,) over the nodes (n, m) of each item, (n,)."""
-    total = value.take(nodes[:, 0])
-    for column in nodes.T[1:]:
-        total += value.take(column)
-    return total / nodes.shape[1]
+    mean = np.empty(len(nodes))
+    fill_corner_means(nodes, value, mean)
+    return mean
 
 
-def element_tensions(model: OrganModel, strain: FloatArray) -> FloatArray:
-    """Tension of each element without Maxwell arms [N/m, Pa], from its strain, both (n_element,)."""
+def element_tensions(model: OrganModel, strain: FloatArray, equivalent: FloatArray) -> FloatArray:
+    """Tension of each element without Maxwell arms [N/m, Pa], (n_element,).
+
+    Args:
+        model: the organ.
+        strain: of the elements, (n_element,).
+        equivalent: strain of the nodes (`node_strains`), (n_node,).
+    """
     tension = element_stiffness(model) * strain
     if not model.stiffens:
         return tension
-    return tension * (1.0 + element_means(model, node_rises(model, node_strains(model, strain))))
+    return tension * (1.0 + element_means(model, node_rises(model, equivalent)))
 
 
 def node_strains(model: OrganModel, strain: FloatArray) -> FloatArray:
-    """Equivalent strain of each node (n_node,), s^2 = 2 U_a / (E_a V_a) (`Stiffening`), from those of elements."""
+    """Equivalent strain of each node, s^2 = 2 U_a / (E_a V_a) (`Stiffening`), from those of elements (n_element,).
+
+    0 of an organ that does not stiffen, (n_node,).
+    """
+    if not model.stiffens:
+        return np.zeros(len(model.node_mass))
     twice = element_size(model) * element_stiffness(model) * np.square(strain)
     return np.sqrt(2.0 * model.node_softness * node_shares(model, twice))
 
@@ -144,8 +161,8 @@ def _ramps(model: OrganModel, strain: FloatArray) -> tuple[FloatArray, FloatArra
     return beyond, np.minimum(beyond, 1.0)
 
 
-def element_energies(model: OrganModel, strain: FloatArray) -> FloatArray:
-    """Energy of each element without Maxwell arms [J], from its strain, both (n_element,).
+def element_energies(model: OrganModel, strain: FloatArray, equivalent: FloatArray) -> FloatArray:
+    """Energy of each element without Maxwell arms [J], (n_element,); arguments as of `element_tensions`.
 
     Their sum is U = sum_a E_a V_a w(s_a), a node's part divided among its elements as their linear energies. The
     gradient over strain is tension times `element_size`.
@@ -153,7 +170,6 @@ def element_energies(model: OrganModel, strain: FloatArray) -> FloatArray:
     twice = element_size(model) * element_stiffness(model) * np.square(strain)
     if not model.stiffens:
         return 0.5 * twice
-    equivalent = node_strains(model, strain)
     beyond, ramp = _ramps(model, equivalent)
     over = beyond - ramp
     added = (
@@ -233,7 +249,9 @@ def tissue_load(model: OrganModel, state: OrganState, shapes: ContactShapes, con
         node_strain = node_strains(model, element_strains(model, state.node_position))
         equivalent = float(node_strain[model.node_excess > 0.0].max())
     place, most = int(pressure.argmax()), int(strain.argmax())
-    return TissueLoad(float(pressure[place]), place, float(strain[most]), most, equivalent)
+    # To rounding, also where two principal values are close.
+    largest = np.abs(np.sqrt(np.maximum(eigh(squared[[most]])[0], 0.0)) - 1.0).max()
+    return TissueLoad(float(pressure[place]), place, float(largest), most, equivalent)
 
 
 def node_pressures(model: OrganModel, state: OrganState, shapes: ContactShapes, contact: ContactLaw) -> FloatArray:
@@ -244,16 +262,15 @@ def node_pressures(model: OrganModel, state: OrganState, shapes: ContactShapes, 
     """
     push = np.zeros(len(model.node_mass))
     add_pressures(model, state, shapes, contact.stiffness, push)
-    third = np.repeat(model.surface_rest_area / 3.0, 3)
-    area = np.bincount(model.surface_triangles.ravel(), third, len(push))
+    area = corner_sums(model, model.surface_triangles, model.surface_rest_area / 3.0)
     return np.divide(push, area, out=np.zeros_like(push), where=area > 0.0)
 
 
 def principal_values(matrices: FloatArray) -> FloatArray:
     """Eigenvalues of symmetric matrices (n, 3, 3), descending, (n, 3); two close ones to 1e-8 of the deviator."""
-    values = np.empty((len(matrices), 3))
-    fill_principal_values(matrices, values)
-    return values
+    values = np.empty((3, len(matrices)))
+    fill_principal_values(np.ascontiguousarray(matrices.transpose(1, 2, 0)), values)
+    return values.T
 
 
 def volume_ratios(model: OrganModel, state: OrganState) -> FloatArray:

@@ -17,6 +17,7 @@ from surgsim_apps.cli.values import (
     shown_path,
     vector_of,
 )
+from surgsim_apps.palpate.field_press import FIELDS_NAME, SERIES_NAME, record_press
 from surgsim_apps.palpate.figures import write_organ_picture, write_stiffness_map
 from surgsim_apps.palpate.palpation import MODEL_MODULUS_ERROR, load_stable_anatomy, run_palpation
 from surgsim_apps.palpate.report import print_report, write_report
@@ -60,6 +61,9 @@ class Palpate:
     """Depth of a press; default: the scene's."""
     spacing: MaybeLength = None
     """Distance between sites; default: the scene's."""
+    fields: bool = False
+    """Record the fields (pressure, stress, stretch, energy) of a press over the first lesion: a
+    series for ParaView in fields/, and a picture in the report."""
     out: MaybePath = None
     """Folder for the results; default: the next free runs/palpate-SCENE-NUMBER."""
     seed: int = 0
@@ -89,7 +93,7 @@ class Palpate:
         _check(self)
         around, lesion_options, below = _around(self), _asked_lesions(self), _asked_below(self)
         scene = with_options(make_scene(self.scene), self.options)
-        names = (REPORT_NAME, CSV_NAME, SUMMARY_NAME, PICTURE_NAME, ORGAN_NAME)
+        names = (REPORT_NAME, CSV_NAME, SUMMARY_NAME, PICTURE_NAME, ORGAN_NAME, FIELDS_NAME, SERIES_NAME)
         default = Path("runs") / f"palpate-{scene.name}"
         with output_folder(self.out or default, names, numbered=self.out is None) as files:
             with StepProgress(console) as progress:
@@ -104,15 +108,22 @@ class Palpate:
                             anatomy.check_inside(lesion)
                     anatomy = load_stable_anatomy(scene, lesions, modulus_factor_largest=1.0 + MODEL_MODULUS_ERROR)
                 palpation = run_palpation(anatomy, lesions=lesions, around=around, seed=self.seed, progress=progress)
+                if self.fields:
+                    record_press(palpation, files / SERIES_NAME, files / FIELDS_NAME, progress)
                 with progress.step("drawing the maps"):
                     write_csv(palpation, files / CSV_NAME)
                     write_summary(palpation, files / SUMMARY_NAME, vars(self))
                     write_stiffness_map(palpation, files / PICTURE_NAME)
                     write_organ_picture(palpation, files / ORGAN_NAME)
-                    pictures = {"maps": files / PICTURE_NAME, "organ": files / ORGAN_NAME}
+                    pictures = {
+                        "maps": files / PICTURE_NAME,
+                        "organ": files / ORGAN_NAME,
+                        "fields": files / FIELDS_NAME,
+                    }
                     write_report(palpation, files / REPORT_NAME, **pictures, command=self.command_line)
         print_report(palpation, console)
-        console.print(f"written: {files.path}/{{{','.join(names)}}}", highlight=False, soft_wrap=True)
+        written = [name for name in names if (files.path / name).exists()]
+        console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0
 
 

@@ -52,7 +52,9 @@ def print_report(palpation: PalpationResult, console: Console) -> None:
     console.print(_counts(palpation))
 
 
-def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: Path, command: str) -> None:
+def write_report(
+    palpation: PalpationResult, path: Path, *, maps: Path, organ: Path, fields: Path, command: str
+) -> None:
     """Write the report page.
 
     Args:
@@ -60,6 +62,7 @@ def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: P
         path: of the page.
         maps: PNG file of `write_stiffness_map`.
         organ: PNG file of `write_organ_picture`.
+        fields: PNG file of `record_press`, if it was written.
         command: the command line that repeats this report.
     """
     scene, entries = palpation.anatomy.scene, palpation.maps[::-1]
@@ -71,6 +74,10 @@ def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: P
     organ_caption = (
         "The contrast against the pre-operative model as a glow, the sites as dots, and the probe on the place of "
         "the strongest contrast."
+    )
+    fields_caption = (
+        "The surface below the tip (dashed) at the end of a press over the first lesion, or at the first site: the "
+        "pressure of each triangle, and means at nodes, over about a cell."
     )
     page = render_page(
         "palpate.html.j2",
@@ -85,6 +92,7 @@ def write_report(palpation: PalpationResult, path: Path, *, maps: Path, organ: P
         ],
         map_picture=Picture.of_file(maps, "Stiffness, and force over depth", map_caption),
         organ_picture=Picture.of_file(organ, "The organ with the probe", organ_caption),
+        fields_picture=Picture.of_file(fields, "Fields of a press", fields_caption) if fields.exists() else None,
         settings=_settings(palpation),
         command=command,
     )

@@ -6,7 +6,7 @@ from surgsim_env.rendering.embedding import organ_surface
 from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.looks import LOOK_SPLITS, draw_look, find_look_ranges, look_generator
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
-from surgsim_env.rendering.painted_fields import PAINTED_FIELDS, PaintedField, field_colours
+from surgsim_env.rendering.painted_fields import COLOUR_MAP, PAINTED_FIELDS, PaintedField, field_colours
 from surgsim_env.rendering.renderer import DrawnCapsule, OrganRenderer, draw_still
 from surgsim_env.rendering.scene_model import geom_colour, is_support, mesh_rows, shown_geoms
 from surgsim_env.rendering.surface import BEND, smooth_normals
@@ -15,6 +15,7 @@ from surgsim_env.rendering.tissue import cut_edges, lesion_ball
 __all__ = [
     "BEND",
     "CAMERAS",
+    "COLOUR_MAP",
     "LOOK_SPLITS",
     "PAINTED_FIELDS",
     "Camera",

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from msdm_core.kernels.structure_kernels import OrganModel
 from msdm_core.mesh.tet_mesh import FloatArray, IntArray
 from msdm_core.organ.fields import TissueFields
+from msdm_core.organ.measure import corner_sums
 
 # Perceptually uniform, and distinct for all kinds of colour blindness.
 COLOUR_MAP = "viridis"
@@ -56,10 +57,7 @@ class PaintedField:
 
 def _node_means(model: OrganModel, items: IntArray, values: FloatArray, weights: FloatArray) -> FloatArray:
     """Mean at each node over the items (n_item, n_corner) around it, by their weights; 0 at nodes of none."""
-    count = items.shape[1]
-    total, weight = (
-        np.bincount(items.ravel(), np.repeat(part, count), len(model.node_mass)) for part in (values * weights, weights)
-    )
+    total, weight = (corner_sums(model, items, part) for part in (values * weights, weights))
     return np.divide(total, weight, out=total, where=weight > 0.0)
 
 

@@ -68,12 +68,13 @@ def arm_energy(model: OrganModel, state: OrganState) -> float:
     if not model.relaxes:
         return 0.0
     strain, size = element_strains(model, state.node_position), element_size(model)
-    energy, total = element_energies(model, strain), 0.0
+    energy, total = element_energies(model, strain, node_strains(model, strain)), 0.0
     for modulus, given in zip(
         model.element_arm_modulus.reshape(ARM_COUNT, -1), state.element_arm_tension.reshape(ARM_COUNT, -1), strict=True
     ):
         reached = _strains_of(model, given)
-        total += float(modulus @ (energy - element_energies(model, reached) - size * given * (strain - reached)))
+        kept = element_energies(model, reached, node_strains(model, reached))
+        total += float(modulus @ (energy - kept - size * given * (strain - reached)))
     return total
 
 

@@ -3,7 +3,9 @@
 import csv
 import json
 from dataclasses import replace
+from xml.etree import ElementTree
 
+import meshio
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -44,6 +46,25 @@ def test_files(run, rows):
     assert tuple(rows[0]) == COLUMNS
     picture = imread(run / "stiffness_map.png")
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
+
+
+def test_fields_of_a_press(tmp_path):
+    """`--fields`: the series ends with the force of a press over the lesion, and the page shows its picture."""
+    options = ["--fields", "--spacing", "0.03", "--out", str(tmp_path)]
+    assert main(["palpate", "--scene", "phantom", *options]) == 0
+    listed = ElementTree.parse(tmp_path / "fields" / "press.pvd").getroot().findall("./Collection/DataSet")
+    last = meshio.read(tmp_path / "fields" / listed[-1].attrib["file"])
+    corners = last.points[last.cells[1].data]
+    area = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    anatomy = load_anatomy(make_scene("phantom"))
+    (truth,) = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["truth"]
+    place, up = np.array([truth["surface_point_m"]]), np.array([[0.0, 0.0, 1.0]])
+    (press,) = scan(anatomy, anatomy.organ(anatomy.demonstration_lesions()), place, up)
+    pressure, shear = (last.cell_data[name][1] for name in ("pressure", "shear"))
+    push = pressure @ area - np.linalg.norm(area, axis=1) @ shear
+    assert push[2] == pytest.approx(press.force, rel=0.01)
+    assert (tmp_path / "fields.png").is_file()
+    assert "Fields of a press" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_table_agrees_with_itself(rows):

@@ -24,7 +24,7 @@ from tests.core.measures import internal_forces
 
 MODULUS, RATIO = 20e3, 0.25
 SHEAR = MODULUS / (2.0 + 2.0 * RATIO)
-BAR, CELLS = np.array([0.02, 0.02, 0.06]), 6
+BAR, CELLS = np.array([0.02, 0.02, 0.06]), 8
 SMALL = 1e-4
 LAW = ContactLaw(stiffness=3e7, damping=100.0, friction=0.3, tangential_stiffness=1.5e7)
 
@@ -137,20 +137,31 @@ def saint_venant(x: NDArray, y: NDArray, half: float) -> tuple[NDArray, NDArray]
 
 
 def test_bar_in_torsion(bar):
-    """Stress of the bar's own torque M: M / (0.1406 a^4) times Saint-Venant's field, by projection on it."""
+    """The stress has the bar's torque M; in the core it is Saint-Venant's of the twist, over all inner nodes that of M.
+
+    Surface springs make the bar 8 % stiffer than the continuum with eight cells (`twice_energy`), 9 % with six. The
+    excess stress is that of nodes within 1.5 cells of the surface: 10 % on it, over Saint-Venant's field with the mean
+    that nodes take, and 1 % two cells below.
+    """
     model, stiffness, ends = bar
     arm = model.node_rest_position - 0.5 * BAR
     turn = np.stack([-arm[ends, 1], arm[ends, 0]], axis=1) * SMALL * model.node_rest_position[ends, 2:] / BAR[2]
     displacement = solve_displacement(stiffness, nodal_dofs(ends, (0, 1)), turn.ravel())
     torque = twice_energy(stiffness, displacement) / SMALL
     fields, weight = fields_of(model, displacement), middle(model)
-    expected = np.stack(saint_venant(arm[:, 0], arm[:, 1], 0.5 * BAR[0]), axis=1) * torque / (0.1406 * BAR[0] ** 4)
-    measured = fields.stress[:, [0, 1], 2]
-    inner = weight * (np.abs(arm[:, :2]).max(axis=1) < 0.5 * BAR[0] - 1e-9)
-    projected = (inner @ (measured * expected).sum(axis=1)) / (inner @ (expected * expected).sum(axis=1))
-    # Springs at the surface carry more than their share of the torque: 4.8 % with six cells, 4.4 % with eight.
-    assert projected == pytest.approx(1.0, rel=0.06)
-    assert np.abs(measured - expected)[inner > 0.0].max() < 0.1 * np.abs(expected).max()
+    measured, depth = fields.stress[:, [0, 1], 2], 0.5 * BAR[0] - np.abs(arm[:, :2]).max(axis=1)
+    moment = np.average(arm[:, 0] * measured[:, 1] - arm[:, 1] * measured[:, 0], weights=weight) * BAR[0] * BAR[1]
+    assert moment == pytest.approx(torque, rel=0.03)
+    field = np.stack(saint_venant(arm[:, 0], arm[:, 1], 0.5 * BAR[0]), axis=1)
+
+    def projected(least: float) -> float:
+        """Factor of the field in the measured stress at nodes deeper than a number of cells."""
+        inner = weight * (depth > least * BAR[0] / CELLS - 1e-9)
+        return (inner @ (measured * field).sum(axis=1)) / (inner @ (field * field).sum(axis=1))
+
+    assert projected(2.0) == pytest.approx(SHEAR * SMALL / BAR[2], rel=0.03)
+    # Not within 3 %: the surface has its excess of the torque, so that 4.4 % are missing inside.
+    assert projected(0.5) == pytest.approx(torque / (0.1406 * BAR[0] ** 4), rel=0.05)
 
 
 # ---- traction --------------------------------------------------------------------------------------------------------
@@ -203,6 +214,10 @@ def test_tractions_sum_to_the_wrench_of_the_next_substep(at, radius, moves):
 
 
 def test_no_traction_after_contact():
-    """A ball lifted off leaves none, though scratch of its contact is still there."""
-    model, state, shapes = pressed_block(BALL, 0.008, 1, (DOWN, -3.0 * DOWN))
+    """None at rest with the ball placed far away, as by `Simulation.restart`: scratch of contact is still there."""
+    model, state, shapes = pressed_block(BALL, 0.008, 1, (DOWN,))
+    for places in (shapes.shape_ends, shapes.tool_centre):
+        places[..., 2] += 0.1
+    state.node_position[:], state.node_velocity[:], state.contact_engaged[:] = model.node_rest_position, 0.0, 0
+    assert state.contact_count[0] > 0
     assert not tissue_fields(model, state, shapes, LAW, 1e-4).traction.any()

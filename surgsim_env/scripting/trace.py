@@ -167,13 +167,18 @@ def _within(times: FloatArray, start: float, stop: float) -> slice:
 # ---- tables --------------------------------------------------------------------------------------------------------
 
 POSE_COLUMNS = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "tip_qz")
+TAXEL_AXES = ("along_row", "along_column", "normal")
 WRENCH_COLUMNS = ("force_x_N", "force_y_N", "force_z_N", "torque_x_Nm", "torque_y_Nm", "torque_z_Nm")
 
 
 def _haptic_rows(trace: Trace) -> Iterator[list]:
     """Names of the columns, then a row for each haptic step."""
     wrenches = [f"{tool}_{column}" for tool in trace.tool_names for column in WRENCH_COLUMNS]
-    taxels = [f"taxel_{'_'.join(map(str, place))}_N" for place in np.ndindex(trace.taxels.shape[1:])]
+    taxels = [
+        f"taxel_{'_'.join(map(str, place))}_{axis}_N"
+        for place in np.ndindex(trace.taxels.shape[1:4])
+        for axis in TAXEL_AXES
+    ]
     yield ["time_s", "step", *POSE_COLUMNS, "depth_m", "force_size_N", *wrenches, *taxels]
     names, sizes = trace.step_names(trace.haptic_time), trace.force_size.tolist()
     for row, time in enumerate(trace.haptic_time.tolist()):

@@ -218,3 +218,12 @@ def test_wrong_descriptions_are_refused(tmp_path, entry, message):
     path.write_text(f"{scene_text('phantom_small')}\n[instrument.taxels]\n{entry}\n")
     with pytest.raises(ValueError, match=message):
         load_scene(path)
+
+
+def test_a_pair_of_arms_with_taxels_is_refused(tmp_path):
+    path = tmp_path / "two.toml"
+    path.write_text(f"{scene_text('lobe')}\n[instrument.taxels]\nrows = 2\n")
+    scene = load_scene(path)
+    paired = replace(scene, instrument=replace(scene.instrument, model="psm_pair"))
+    with pytest.raises(ValueError, match="pairs of arms do not read them"):
+        Simulation(load_anatomy(paired))

@@ -15,7 +15,7 @@ from surgsim_env.scripting.trace import contact_depth
 @cache
 def pressed():
     """A run with a press, and the environment after it."""
-    env = gym.make("SurgSim/Palpate-v0")
+    env = gym.make("SurgSim/Palpate-v0", instrument="tactile_probe")
     env.reset(seed=2)
     env.unwrapped.simulation.restart(np.array([0.03, 0.03, 0.039]))
     return run_script(env, [PressUntil(0.15, 0.008), Hold(0.1, name="a, hold"), Lift(0.006), Hold(0.05)])
@@ -24,7 +24,16 @@ def pressed():
 def test_cuts_are_the_steps_and_together_the_whole():
     trace = pressed()
     parts = [trace.between(step.name) for step in trace.steps]
-    for name in ("haptic_time", "wrench", "tip_position", "tip_orientation", "depth", "control_time", "observation"):
+    for name in (
+        "haptic_time",
+        "wrench",
+        "taxels",
+        "tip_position",
+        "tip_orientation",
+        "depth",
+        "control_time",
+        "observation",
+    ):
         whole = np.concatenate([getattr(part, name) for part in parts])
         assert whole.tobytes() == getattr(trace, name).tobytes(), name
     assert sum((part.infos for part in parts), ()) == trace.infos
@@ -74,6 +83,11 @@ def test_tables_read_back_to_the_bit_and_repeat_to_the_byte(tmp_path):
     assert turned.tobytes() == trace.tip_orientation.tobytes()
     names = [f"tip_force_{axis}_N" for axis in "xyz"] + [f"tip_torque_{axis}_Nm" for axis in "xyz"]
     assert np.stack([column(table, name) for name in names], axis=1).tobytes() == trace.wrench[:, 0].tobytes()
+    names = [f"taxel_0_{row}_{place}_normal_N" for row in range(4) for place in range(4)]
+    normal = np.stack([column(table, name) for name in names], axis=1)
+    assert normal.tobytes() == trace.taxels[..., 2].tobytes() and len(table[0]) == 17 + 48
+    # The probe points down, the wrench up.
+    np.testing.assert_allclose(normal.sum(axis=1), trace.wrench[:, 0, 2], rtol=0, atol=1e-12 * trace.peak_force)
     # Each row belongs to the step that was running.
     assert [(column(table, "step", str) == step.name).sum() for step in trace.steps] == [
         len(trace.between(step.name).haptic_time) for step in trace.steps
@@ -81,7 +95,7 @@ def test_tables_read_back_to_the_bit_and_repeat_to_the_byte(tmp_path):
     table = read(control)
     assert column(table, "time_s").tobytes() == trace.control_time.tobytes()
     assert column(table, "reward").tobytes() == trace.reward.tobytes()
-    seen = np.stack([column(table, f"observation_{index}") for index in range(10)], axis=1).astype(np.float32)
+    seen = np.stack([column(table, f"observation_{index}") for index in range(58)], axis=1).astype(np.float32)
     assert seen.tobytes() == trace.observation.tobytes()
     assert column(table, "force_peak").max() == max(info["force_peak"] for info in trace.infos)
     again = trace.to_csv(tmp_path / "again.csv")
@@ -95,6 +109,7 @@ def made_up(wrench, name):
         start=0.0,
         haptic_time=time,
         wrench=wrench,
+        taxels=np.zeros((3, 0, 0, 0, 3)),
         tip_position=np.zeros((3, 3)),
         tip_orientation=np.zeros((3, 4)),
         depth=np.zeros(3),

@@ -63,10 +63,10 @@ class Pair(SteeredArms):
                 "left arm's first: add them, or take a scene that has them, such as 'lobe'"
             )
         arms = {side: load_scene_arm(anatomy, name, port) for side, name, port in zip(SIDES, names, scene.ports)}
-        if any(arm.description.taxels is not None for arm in arms.values()):
+        if any(part.taxels is not None for part in (scene.instrument, *(arm.description for arm in arms.values()))):
             raise ValueError(
-                f"scene {scene.name!r}: an arm of {scene.instrument.model!r} has [taxels], which a pair does not read: "
-                "take the arm alone, or leave them out of its file"
+                f"scene {scene.name!r}: the pair {scene.instrument.model!r} has taxels, and pairs of arms do not read "
+                "them: take one arm alone, or leave [taxels] out of the scene's and the arms' files"
             )
         with warned(f"scene {scene.name!r}"):
             model = _compile(arms, scene)

@@ -131,7 +131,8 @@ def contact_points(
     # Scratch is written again in every call; a substep far from every surface leaves the count as it was.
     kept: dict[str, Any] = {name: getattr(state, name).copy() for name in KEPT_NAMES}
     trial = state._replace(**kept, contact_count=np.zeros_like(state.contact_count))
-    moved = ContactShapes(*(field.copy() for field in shapes))
+    copies: Any = [field.copy() for field in shapes]
+    moved = ContactShapes(*copies)
     fault = advance_organ(model, trial, moved, contact, dt, 1, np.zeros((len(shapes.tool_centre), 6)))
     if fault != FAULT_NONE:
         raise OrganDivergedError(describe_fault(model, trial, fault))

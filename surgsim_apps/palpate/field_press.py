@@ -63,7 +63,7 @@ def _write_picture(press: SitePress, path: Path) -> None:
     near = (np.abs(view.flat(points) - (x, y)).max(axis=1) < 1.5 * half)[model.surface_triangles].any(axis=1)
     triangles = model.surface_triangles[near]
     patches = curved_patches(points, triangles)
-    lattice, small = triangle_lattice(round((len(patches.origin) / len(triangles)) ** 0.5))
+    lattice, small = triangle_lattice(round(np.sqrt(len(patches.origin) / len(triangles))))
     shares = np.tile(lattice[small].mean(axis=1) / lattice.max(), (len(triangles), 1))
     # Stretch at nodes: mean of the tets around each, by undeformed volume.
     quarter = np.repeat(0.25 * model.tet_rest_volume * fields.principal_stretch[:, 0], 4)

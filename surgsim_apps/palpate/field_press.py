@@ -63,7 +63,7 @@ def _write_picture(press: SitePress, path: Path) -> None:
     near = (np.abs(view.flat(points) - (x, y)).max(axis=1) < 1.5 * half)[model.surface_triangles].any(axis=1)
     triangles = model.surface_triangles[near]
     patches = curved_patches(points, triangles)
-    lattice, small = triangle_lattice(round((len(patches.origin) / len(triangles)) ** 0.5))
+    lattice, small = triangle_lattice(round(np.sqrt(len(patches.origin) / len(triangles))))
     shares = np.tile(lattice[small].mean(axis=1) / lattice.max(), (len(triangles), 1))
     figure = Figure(figsize=(11.0, 9.6), dpi=110, facecolor=PAPER, layout="constrained")
     for axes, field in zip(figure.subplots(2, 2).flat, PAINTED_FIELDS.values(), strict=True):

@@ -60,7 +60,9 @@ def pressed_displacement(model: OrganModel) -> FloatArray:
     for _ in range(ROUNDS):
         held = csr_array(slope.T @ diags_array(stiffness * touching))
         whole = csr_array(tissue + held @ slope)
-        moved, code = cg(whole, -(held @ overlap), x0=moved, rtol=1e-9, M=diags_array(1.0 / whole.diagonal()))
+        moved, code = cg(
+            whole, -(held @ overlap), x0=moved, rtol=1e-9, M=diags_array(1.0 / np.asarray(whole.diagonal()))
+        )
         assert code == 0
         before, touching = touching, overlap + slope @ moved > 0.0
         if np.array_equal(before, touching):

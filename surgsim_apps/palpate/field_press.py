@@ -71,7 +71,7 @@ def _write_picture(press: SitePress, path: Path) -> None:
         values = (shares * corners[patches.origin]).sum(axis=1)
         norm = Normalize(field.lowest, field.scale_end(values))
         draw_patches(axes, [(patches, colormaps[COLOUR_MAP](norm(values))[:, :3], 0.0)], view, flatness=0.6)
-        axes.add_patch(Circle((x, y), radius, fill=False, ls="--", color=INK))
+        axes.add_patch(Circle((x, y), radius, fill=False, ls="--", color="white"))
         figure.colorbar(ScalarMappable(norm, COLOUR_MAP), ax=axes, shrink=0.8, pad=0.02)
         axes.set_title(f"{field.title} [{field.unit}]" if field.unit else field.title, color=INK, fontsize=11)
         axes.set_aspect("equal")

@@ -190,6 +190,11 @@ class Simulation:
         """Largest of `node_dose` [Pa s]."""
         return float(self.node_dose.max())
 
+    @property
+    def damage(self) -> FloatArray:
+        """Damage index of each node, its dose over the scene's limit, (n_node,); 0 where the scene has none."""
+        return self.node_dose / (self.anatomy.scene.limits.dose or math.inf)
+
     def fields(self) -> TissueFields:
         """Contact traction, stress, stretch and energy of the organ as it is now, with the contact of the next substep.
 

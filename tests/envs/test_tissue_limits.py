@@ -80,7 +80,7 @@ def test_too_much_ends_the_episode_as_a_safety_stop(tmp_path, limit, entry):
 @pytest.mark.parametrize("steps_per_control", [50, 20])
 def test_dose_of_a_held_press_is_pressure_times_time(tmp_path, steps_per_control):
     """A ball held still: its pressure is constant to 1e-3, and the dose rises by p t at the node below it."""
-    scene = make_scene(written(tmp_path, dose=np.inf))
+    scene = make_scene(written(tmp_path, dose=1e5))
     simulation = Simulation(load_anatomy(scene))
     face = simulation.anatomy.face
     middle = face.points.mean(axis=0)
@@ -102,6 +102,8 @@ def test_dose_of_a_held_press_is_pressure_times_time(tmp_path, steps_per_control
     assert risen[after.pressure_node] == pytest.approx(after.pressure * 1.0, rel=1e-3)
     assert risen.max() == risen[after.pressure_node]
     assert simulation.tissue_dose == simulation.node_dose.max()
+    np.testing.assert_array_equal(simulation.damage, simulation.node_dose / 1e5)
+    assert 0.0 < simulation.damage.max() < 1.0
 
 
 def test_dose_adds_the_pressure_at_the_end_of_each_control_step(tmp_path):

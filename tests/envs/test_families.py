@@ -135,16 +135,17 @@ def test_the_map_of_a_member_is_made_once_from_its_template_and_few_presses(bloc
     member_chart.member_map.cache_clear()
 
     def press_sites(anatomy, sites, progress, dtype=None, name=""):
-        """Twice as stiff as the template, everywhere."""
+        """Twice as stiff as the template, its centre of pressure 2 mm further along, everywhere."""
         pressed.append((str(anatomy.member), len(sites), name))
-        return np.full(len(sites), 100.0)
+        return np.tile([100.0, 0.001, 0.005], (len(sites), 1))
 
     monkeypatch.setattr(member_chart, "press_sites", press_sites)
-    monkeypatch.setattr(member_chart, "healthy_map_of", lambda anatomy: chart.HealthyMap(np.full((13, 13), 50.0)))
+    flat = chart.HealthyMap(np.tile([50.0, 0.001, 0.003], (13, 13, 1)))
+    monkeypatch.setattr(member_chart, "healthy_map_of", lambda anatomy, between: flat)
     template = load_anatomy(load_scene(Path(blocks)))
     for number in (0, 1, 0):
         healthy = member_chart.member_map(template, MemberName("test", number))
-        np.testing.assert_allclose(healthy.grid, 100.0, rtol=1e-12)
+        np.testing.assert_allclose(healthy.grid, np.tile([100.0, 0.001, 0.005], (13, 13, 1)), rtol=1e-12)
     count = member_chart.PRESS_COUNT
     assert pressed == [("test 0", count, "test 0"), ("test 1", count, "test 1")]
     assert len(list((tmp_path / "cache").iterdir())) == 2
@@ -163,8 +164,10 @@ def test_healthy_members_have_contrast_one(blocks):
     charted = charted_face(member)
     sites = charted.grid_sites()[::9]
     with chart.StepProgress(None) as progress:
-        stiffness = chart.press_sites(member, sites, progress)
-    expected = member_chart.member_map(template, name).stiffness(np.array([site.place for site in sites]))
-    error = np.log(stiffness / expected)
+        presses = chart.press_sites(member, sites, progress)
+    healthy, places = member_chart.member_map(template, name), np.array([site.place for site in sites])
+    error = np.log(presses[:, 0] / healthy.stiffness(places))
     print(f"\nlog contrast of healthy presses: deviation {error.std():.4f}, largest {np.abs(error).max():.4f}")
     assert np.abs(error).max() < 0.03 and error.std() < 0.01
+    # The centre of pressure: within a share of the contact radius that the mesh moves it by.
+    assert np.abs(presses[:, 1:] - healthy.centre(places)).max() < 0.1 * np.sqrt(0.008 * scene.palpation.press_depth)

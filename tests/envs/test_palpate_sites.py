@@ -187,9 +187,9 @@ def test_the_map_is_made_once_for_an_organ(tmp_path, monkeypatch):
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     made = []
 
-    def pressed(anatomy, progress, dtype=None):
+    def pressed(anatomy, progress, dtype, between=1):
         made.append(anatomy.scene.name)
-        return np.full((13, 13), 50.0)
+        return np.full((13, 13, 3), 50.0)
 
     monkeypatch.setattr(healthy_module, "_pressed", pressed)
     scene = make_scene("phantom_small")
@@ -278,8 +278,8 @@ def test_a_fault_ends_the_episode_with_the_last_finite_observation():
 
 
 def test_the_budget_of_a_wide_scene_is_larger(monkeypatch):
-    flat = healthy_module.HealthyMap(np.full((25, 25), 55.0))
-    monkeypatch.setattr(palpate_sites, "healthy_map_of", lambda _: flat)
+    flat = healthy_module.HealthyMap(np.full((25, 25, 3), 55.0))
+    monkeypatch.setattr(palpate_sites, "healthy_map_of", lambda *_: flat)
     assert gym.make(ID, scene="phantom_wide").unwrapped.task.budget == 60
     assert gym.make(ID, scene="phantom_wide", budget=7).unwrapped.task.budget == 7
 

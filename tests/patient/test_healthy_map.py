@@ -32,10 +32,10 @@ def presses(tmp_path, monkeypatch):
     """The scenes whose healthy organ is pressed; presses are not made, and the cache is empty."""
     made = []
 
-    def pressed(anatomy, progress, dtype=None):
+    def pressed(anatomy, progress, dtype, between=1):
         made.append(anatomy.scene.name)
         side = chart.charted_face(anatomy).chart.side_count
-        return np.full((side, side), 50.0)
+        return np.full((side, side, 3), 50.0)
 
     monkeypatch.setenv("SURGSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(chart, "_pressed", pressed)

@@ -29,6 +29,7 @@ class Episodes(ScoringOptions):
     level: MaybeText = None
     split: MaybeText = None
     motion: MaybeText = None
+    instrument: MaybeText = None
     seeds: MaybeText = None
     episodes: MaybeCount = None
     budget: MaybeCount = None

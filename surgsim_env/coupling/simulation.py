@@ -457,6 +457,7 @@ class Simulation:
         motion["motion_cycle_size_drawn"] = self._drawn.cycle_size.copy()
         motion["motion_delay_drawn"] = self._drawn.delay.copy()
         motion["motion_start"] = np.array(self._motion_start)
+        taxels = self.instrument.shapes.taxel_force
         return {
             **arrays,
             **(motion if self.anatomy.scene.motions else {}),
@@ -465,7 +466,7 @@ class Simulation:
             "rest_position": self._rest_position.copy(),
             "rest_stretch": self._rest_stretch.copy(),
             "wrench": self._wrench.copy(),
-            "taxel_force": self.instrument.shapes.taxel_force.copy(),
+            **({"taxel_force": taxels.copy()} if len(taxels) else {}),
             "pull_peak": np.array(self.pull_peak),
             "step": np.array(self._step),
             "fault": np.array(self.fault),
@@ -502,7 +503,8 @@ class Simulation:
         self._rest_position = arrays["rest_position"].copy()
         self._rest_stretch = arrays["rest_stretch"].copy()
         self._wrench[:] = arrays["wrench"]
-        self.instrument.shapes.taxel_force[:] = arrays["taxel_force"]
+        if self.instrument.patches is not None:
+            self.instrument.shapes.taxel_force[:] = arrays["taxel_force"]
         self.pull_peak = float(arrays["pull_peak"])
         self._step = self._dosed_step = int(arrays["step"])
         if self._measures_dose:

@@ -12,7 +12,7 @@ from surgsim_env.scene.model import Scene
 from surgsim_env.tasks.runtime import TaskRuntime
 
 # Version of the format.
-STATE_VERSION = 3
+STATE_VERSION = 2
 
 
 def state_maker(kind: str, scene: Scene, mesh: TetMesh) -> str:

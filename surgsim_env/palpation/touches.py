@@ -41,8 +41,6 @@ class Touch:
         log_contrast: log of stiffness over healthy stiffness.
         cut: True if the log contrast, or a part of the gradient, was clipped to its bound.
         stopped: True if force ended the motion inward before depth did.
-        gradient: of the log contrast along the chart's sides, from the shift of the centre of pressure [1/m]; 0 without
-            taxels.
     """
 
     place: tuple[float, float]
@@ -52,7 +50,6 @@ class Touch:
     log_contrast: float = 0.0
     cut: bool = False
     stopped: bool = False
-    gradient: tuple[float, float] = (0.0, 0.0)
 
     @property
     def stiffness(self) -> float:
@@ -65,6 +62,9 @@ class SiteTouches:
 
     Fields:
         touches: of the presses, in their order
+        gradients: of the log contrast at the presses along the chart's sides, from the shift of the centre of pressure
+            [1/m], 0 without taxels (n, 2)
+        taxels: of the last press [N], (n_patch, rows, columns, 3); none before the first or without taxels
         seconds, path_length: of the tip so far [s], [m], with the counted travel between sites
         map_shift: offset of the healthy map from the organ along the chart's sides [m] (2,)
     """
@@ -77,6 +77,7 @@ class SiteTouches:
     def clear(self) -> None:
         """Begin an episode."""
         self.touches: list[Touch] = []
+        self.gradients = np.zeros((0, 2))
         self.seconds = self.path_length = 0.0
         self._last_start: FloatArray | None = None
         self.taxels = np.zeros(0)
@@ -114,9 +115,9 @@ class SiteTouches:
                 gradient = (centre / total - self.healthy.centre(on_map)) / self.gradient_gain
         held = np.clip(gradient, -bound, bound)
         cut = bounded != log_contrast or bool((held != gradient).any())
-        gu, gv = held.tolist()
-        self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped, (gu, gv)))
-        self._mark(self.touches[-1])
+        self.gradients = np.vstack([self.gradients, held])
+        self.touches.append(Touch((u, v), site.moved, force, result.depth, bounded, cut, result.stopped))
+        self._mark(self.touches[-1], held)
         start = site.point + site.normal * self.palpation.clearance
         travel = 0.0 if self._last_start is None else math.dist(start, self._last_start)
         stroke = self.palpation.clearance + result.depth
@@ -140,11 +141,6 @@ class SiteTouches:
         """Shift of the centre of pressure over the gradient of the log contrast [m^2]."""
         return GRADIENT_GAIN * self.charted.tip_radius * self.palpation.press_depth
 
-    @property
-    def gradients(self) -> FloatArray:
-        """Gradient of the log contrast at the presses along the chart's sides [1/m], shape (n, 2)."""
-        return np.array([touch.gradient for touch in self.touches]).reshape(-1, 2)
-
     def maps(self) -> FloatArray:
         """Log contrast, 1 for pressed sites, and both parts of the gradient [1/m], of the touch map, (4, n_site).
 
@@ -152,9 +148,9 @@ class SiteTouches:
         """
         return self._maps
 
-    def _mark(self, touch: Touch) -> None:
+    def _mark(self, touch: Touch, gradient: FloatArray) -> None:
         site = self.charted.touch_map.nearest(touch.place)
-        self._maps[:, site] = touch.log_contrast, 1.0, *touch.gradient
+        self._maps[:, site] = touch.log_contrast, 1.0, *gradient
 
     def get_state(self) -> dict[str, Any]:
         """Record as a table for JSON."""
@@ -163,21 +159,21 @@ class SiteTouches:
             "way": [self.seconds, self.path_length],
             "last_start": None if self._last_start is None else self._last_start.tolist(),
             "map_shift": self.map_shift.tolist(),
-            "taxels": self.taxels.ravel().tolist(),
+            **({"gradients": self.gradients.tolist(), "taxels": self.taxels.tolist()} if self.taxels.size else {}),
         }
 
     def set_state(self, table: Mapping[str, Any]) -> None:
         """Restore a record from `get_state`."""
         self.clear()
-        for touch in table["touches"]:
-            pairs = {name: tuple(touch[name]) for name in ("place", "gradient")}
-            self.touches.append(Touch(**{**touch, **pairs}))
-            self._mark(self.touches[-1])
+        self.gradients = np.array(table.get("gradients", np.zeros((len(table["touches"]), 2))))
+        for touch, gradient in zip(table["touches"], self.gradients, strict=True):
+            self.touches.append(Touch(**{**touch, "place": tuple(touch["place"])}))
+            self._mark(self.touches[-1], gradient)
         self.seconds, self.path_length = table["way"]
         start = table["last_start"]
         self._last_start = None if start is None else np.array(start)
         self.map_shift = np.array(table["map_shift"])
-        self.taxels = np.array(table["taxels"])
+        self.taxels = np.array(table.get("taxels", []))
 
 
 def felt_lesion_radius(scene: Scene) -> float:

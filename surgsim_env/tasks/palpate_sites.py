@@ -415,8 +415,8 @@ class PalpateSitesTask(Task):
     @property
     def record(self) -> dict[str, Any]:
         """Record of the readings and the sensor's bias, as a table for JSON."""
-        drift = [] if self.taxel_reading is None else self.taxel_reading.get_state()
-        return {"bias": self.reading.get_state(), "drift": drift, **self.felt.get_state()}
+        drift = {} if self.taxel_reading is None else {"drift": self.taxel_reading.get_state()}
+        return {"bias": self.reading.get_state(), **drift, **self.felt.get_state()}
 
     @record.setter
     def record(self, table: dict[str, Any]) -> None:

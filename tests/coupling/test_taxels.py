@@ -58,7 +58,7 @@ def test_their_sum_is_the_wrench_of_the_haptic_step_pressed_and_sliding(shape):
 
 def test_their_centre_is_that_of_the_contact_points():
     """Weights keep the mean place of contact points within the patch."""
-    simulation = pressed(Taxels(4, 4, pitch=0.004))
+    simulation = pressed(Taxels(4, 4, pitch=0.004), aside=(0.009, 0.004))
     simulation.instrument.command_velocity(np.zeros(3))
     simulation.control_step(100)
     points = simulation.contact_points()

@@ -50,7 +50,7 @@ class SiteFacts:
         noise: standard deviation of one log contrast by the force sensor
         excess_least: the estimator's least excess of the log contrast of a lesion
         budget: presses of an episode
-        gradient_noise: standard deviation of one gradient of the log contrast by the taxels [1/m]; 0 without
+        gradient_noise: standard deviation of one gradient of the log contrast by taxels and map [1/m]; 0 without
     """
 
     map: TouchMap

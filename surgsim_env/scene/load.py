@@ -179,7 +179,10 @@ def with_instrument(scene: Scene, instrument: str | None) -> Scene:
 def _with_taxels(scene: Scene) -> Scene:
     """Scene with the taxels of its arm's file; another instrument keeps its own."""
     name = scene.instrument.model
-    path = scenes_folder() / "instruments" / f"{name}.toml" if name in list_arms() else scene.folder / name
+    beside = scene.folder / name
+    path = beside if beside.is_file() else Path(name)
+    if name in list_arms():
+        path = scenes_folder() / "instruments" / f"{name}.toml"
     if path.suffix != ".toml" or not path.is_file():
         return scene
     entries = read_toml(path, "arm").get("taxels")

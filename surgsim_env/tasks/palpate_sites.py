@@ -201,7 +201,7 @@ class PalpateSitesTask(Task):
         Channel(
             "gradient_noise", lambda task: int(task.memory and task.taxel_reading is not None), "", 0.0, NOISE_BOUND,
             read=lambda task, simulation: task.charted.tip_radius * task.estimator.gradient_noise,
-            meaning="with taxels: standard deviation of one gradient by their noise, times the tip's radius",
+            meaning="with taxels: standard deviation of one gradient by noise and healthy map, times the tip's radius",
             size_text="1 or 0",
         ),
         Channel(

@@ -151,13 +151,14 @@ def test_a_saved_state_has_them():
     assert first[0][env.observation_slices["taxels"]].any()
 
 
-def test_an_arms_file_declares_them(tmp_path):
-    """The da Vinci-like palpator: four taxels around the pole of its tip, for a scene that names the file."""
+def test_an_arms_file_declares_them(tmp_path, monkeypatch):
+    """The da Vinci-like palpator: four taxels around the pole of its tip, for a file named from the working folder."""
+    monkeypatch.chdir(tmp_path)
     folder = scenes_folder() / "instruments"
     (tmp_path / "psm_palpator.xml").write_text((folder / "psm_palpator.xml").read_text(encoding="utf-8"))
     own, text = tmp_path / "own.toml", (folder / "psm_palpator.toml").read_text(encoding="utf-8")
     own.write_text(f"{text}\n[taxels]\nrows = 2\ncolumns = 2\n")
-    env = gym.make("SurgSim/Palpate-v0", scene="phantom", instrument=str(own)).unwrapped
+    env = gym.make("SurgSim/Palpate-v0", scene="phantom", instrument=own.name).unwrapped
     env.reset(seed=0)
     while np.linalg.norm(env.simulation.contact_force) < 0.1:
         env.step(env.layout.action([0.0, 0.0, -0.02]).astype(np.float32))

@@ -15,6 +15,7 @@ from surgsim_env.tasks.bimanual_retract import BimanualRetractTask
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks.slide import SlideTask
 from surgsim_env.tasks.task import Task
 
 # The task of each registered id.
@@ -117,3 +118,4 @@ def register() -> None:
     register_task("SurgSim/Retract-v0", RetractTask)
     register_task("SurgSim/BimanualRetract-v0", BimanualRetractTask, lanes=False)
     register_task("SurgSim/PalpateSites-v0", PalpateSitesTask)
+    register_task("SurgSim/Slide-v0", SlideTask)

@@ -1,4 +1,4 @@
-"""OSPA, the error of estimated places of lesions."""
+"""Errors of estimated lesions: OSPA of their places, Dice of their areas."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,12 @@ def ospa(truth: FloatArray, estimate: FloatArray, cutoff: float) -> float:
         return 0.0
     distance = np.minimum(matched_distances(truth, estimate, cutoff)[2], cutoff)
     return float(distance.sum() + cutoff * (larger - len(distance))) / larger
+
+
+def dice(truth: NDArray[np.bool_], estimate: NDArray[np.bool_]) -> float:
+    """Coefficient of two masks (n,), 2 |A and B| / (|A| + |B|) (Dice 1945); 1 where both are empty."""
+    total = int(truth.sum() + estimate.sum())
+    return 2.0 * float((truth & estimate).sum()) / total if total else 1.0
 
 
 def matched_distances(

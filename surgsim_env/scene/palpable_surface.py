@@ -61,6 +61,11 @@ class PalpableFace:
         """Point of the face nearest to a point [m] and the unit outward normal there, each (3,)."""
         return self._at(*self._nearest(np.asarray(point, dtype=np.float64)))
 
+    def below(self, point: ArrayLike) -> tuple[FloatArray, FloatArray, float]:
+        """As `project`, with the thickness of the organ below the point of the face [m]."""
+        face, weights = self._nearest(np.asarray(point, dtype=np.float64))
+        return *self._at(face, weights), float(self.thickness[face])
+
     @cached_property
     def _nearest(self) -> NearestTriangle:
         return NearestTriangle(self.points[self.triangles])

@@ -6,6 +6,7 @@ from surgsim_env.tasks.layout import channel_slices
 from surgsim_env.tasks.palpate import DECLARE_STEPS, DECLARE_VALUE, EPISODE_STEPS, START_GAP, PalpateTask, touch_memory
 from surgsim_env.tasks.palpate_sites import BUDGET, BUDGET_WIDE, SUCCESS_ERROR, WIDE, PalpateSitesTask
 from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks.slide import SlideTask
 from surgsim_env.tasks.task import Task
 from surgsim_env.tasks.visibility import Disc, uncovered
 
@@ -25,6 +26,7 @@ __all__ = [
     "PalpateSitesTask",
     "PalpateTask",
     "RetractTask",
+    "SlideTask",
     "Task",
     "channel_slices",
     "reward_weights",

@@ -13,6 +13,8 @@ from PIL import Image
 
 import surgsim_env  # noqa: F401  (registers the environments)
 from surgsim_apps.reports.output_folder import output_folder
+from surgsim_apps.scoring.episodes import episode_facts
+from surgsim_apps.scoring.slide_search import SlideSweep
 from surgsim_env.envs import SurgicalEnv
 from surgsim_env.scripting import oracle_script, run_script
 
@@ -84,6 +86,18 @@ def film_presses(path: Path, *, seed: int) -> None:
     write(frames, path, PRESS_SHOWN_MS)
 
 
+def film_slide(path: Path, *, seed: int) -> None:
+    """A sweep over a liver, with the pressure on its surface."""
+    env = Filmed(make("SurgSim/Slide-v0", surface=True, show_lesion=True), ("overview",), 8)
+    agent, over = SlideSweep(), False
+    observation, _ = env.reset(seed=seed)
+    agent.reset(np.random.default_rng(seed), episode_facts(env, "SurgSim/Slide-v0", {}))
+    while not over:
+        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
+        over = terminated or truncated
+    write(env.frames, path, 100)
+
+
 def draw_tutorial(name: str, path: Path) -> None:
     """The picture of a tutorial on one's own organ or robot, by its code."""
     text = (Path(__file__).parent / "tutorials" / f"own_{name}.md").read_text(encoding="utf-8")
@@ -101,6 +115,7 @@ def main(names: list[str]) -> None:
     films = {
         "palpate": lambda path: film_oracle("SurgSim/Palpate-v0", path, "overview", seed=3, show_lesion=True),
         "palpate_sites": lambda path: film_presses(path, seed=4),
+        "slide": lambda path: film_slide(path, seed=5),
         "retract": lambda path: film_oracle("SurgSim/Retract-v0", path, "overview", "endoscope", seed=4),
         "bimanual_retract": lambda path: film_oracle(
             "SurgSim/BimanualRetract-v0", path, "overview", "endoscope", seed=4, every=4

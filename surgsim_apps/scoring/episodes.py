@@ -306,7 +306,16 @@ def task_figures(
         "hard_limit_share": [bool(record.last["hard_limit"]) for record in records],
         "fault_share": [bool(record.last["sim_fault"]) for record in records],
     }
-    for name in ("torn", "visible", "grip_force_peak", "pull_force_peak", "pull_force_mean", "slips", "path_length"):
+    for name in (
+        "map_score",
+        "torn",
+        "visible",
+        "grip_force_peak",
+        "pull_force_peak",
+        "pull_force_mean",
+        "slips",
+        "path_length",
+    ):
         if name in records[0].last:
             columns[name] = [float(record.last[name]) for record in records]
     if "error_mm" in records[0].last:

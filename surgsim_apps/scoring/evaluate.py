@@ -48,6 +48,7 @@ from surgsim_apps.scoring.results import (
     shipped_results,
 )
 from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
+from surgsim_apps.scoring.slide_search import SLIDES
 from surgsim_apps.training.site_agent import site_facts
 from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
 from surgsim_env.step_progress import StepProgress
@@ -56,6 +57,7 @@ from surgsim_env.step_progress import StepProgress
 BOOTSTRAP_SEED = 0
 # Default scene and level of an evaluation.
 PLACES = {"scene": "phantom", "level": "standard"}
+SLIDE, SLIDE_PLACES = "SurgSim/Slide-v0", {"scene": "liver_family", "level": "clinical"}
 # Arguments of SurgSim/Palpate-v0 for observations independent of an organ's size and pose.
 IN_FACE = {"memory": True, "frame": "face"}
 # Default split of a family of organs.
@@ -94,11 +96,23 @@ class TaskAgent:
         env_id: the environment's.
         make: the script, for the environment's arguments.
         kwargs: further arguments of the environment.
+        sees_truth: True if it sees hidden truth.
     """
 
     env_id: str
-    make: Callable[[dict[str, Any]], Actor]
+    make: Callable[[dict[str, Any]], Actor | EpisodeActor]
     kwargs: dict[str, Any] = field(default_factory=dict)
+    sees_truth: bool = False
+
+
+def _slide(make: Callable[[], Any]) -> TaskAgent:
+    """An agent of SurgSim/Slide-v0 that observes the known surface."""
+    return TaskAgent(
+        SLIDE,
+        lambda kwargs: AgentActor(make, lambda env: episode_facts(env, SLIDE, kwargs)),
+        {"surface": True},
+        sees_truth(make()),
+    )
 
 
 def _organ_expert(*, blind: bool) -> Actor:
@@ -116,6 +130,7 @@ TASK_AGENTS = {
         {"memory": True},
     ),
     "expert_organs": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=False), IN_FACE),
+    **{name: _slide(make) for name, make in SLIDES.items()},
     "blind_middle": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=True), IN_FACE),
 }
 # Oracles that play a script, by environment.
@@ -214,7 +229,7 @@ def find_player(name: str, options: ScoringOptions) -> Player:
     if name in TASK_AGENTS:
         script = TASK_AGENTS[name]
         kwargs = _places(options, _defaults(script.env_id)) | script.kwargs
-        return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by)
+        return Player(name, script.make(kwargs), script.env_id, kwargs, chosen_by, script.sees_truth)
     if name not in AGENTS:
         raise ValueError(f"agent {name!r} is unknown; the agents are {', '.join([*AGENTS, *TASK_AGENTS, *ORACLES])}")
     make, kwargs = AGENTS[name], _places(options, PLACES)
@@ -229,7 +244,7 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     for argument in (*PLACES, "split", "motion", "instrument", "budget"):
         if argument in options.env_kwargs and getattr(options, argument) is not None:
             raise ValueError(f"{argument} is given by --{argument} and in --env-arguments: leave one out")
-    own = {**(PLACES if env_id == SITES else {}), **options.env_kwargs}
+    own = {**(_defaults(env_id) if env_id in (SITES, SLIDE) else {}), **options.env_kwargs}
     # A split in --env-arguments precedes the default one.
     kwargs = {**_places(options, own), **options.env_kwargs}
     all_kwargs = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
@@ -240,7 +255,7 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
 
 def _defaults(env_id: str) -> dict[str, str]:
     """Default scene and level; none for an environment without levels."""
-    return PLACES if "Palpate" in env_id else {}
+    return SLIDE_PLACES if env_id == SLIDE else PLACES if "Palpate" in env_id else {}
 
 
 def _declared(agent: Any) -> tuple[bool, bool]:

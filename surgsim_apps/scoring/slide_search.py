@@ -10,15 +10,27 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_env.palpation import MAP_SIDE, LesionEstimate, LesionEstimator, TouchMap
+from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, LesionEstimate, LesionEstimator, TouchMap
 from surgsim_env.tasks import SlideTask
 
 FloatArray = NDArray[np.float64]
 
+# Numbers of a declared lesion: presence, place (2), radius.
+LESION_NUMBERS = 4
+
 # Set point of the scripts' force over the soft limit, and distance between the rows of a sweep [tip radii].
 PRESS, ROW_SPACING = 0.5, 1.8
-# A place of the way counts as reached this near [tip radii]; after so many control steps without progress it is left out.
+# A place of the way counts as reached this near [tip radii]; it is left out after so many control steps without
+# progress.
 REACHED, PATIENCE = 0.5, 10
+# Deviation of a site's log stiffness by the sensor, and that of healthy tissue about the fit by the surface.
+READING_NOISE, HEALTHY_SPREAD = 0.1, 0.1
+# Gradient of the log stiffness per centre of pressure [1 / (tip radius taxel)], and its deviation [1 / tip radius].
+GRADIENT_GAIN, GRADIENT_NOISE = 1.0, 0.5
+# Least normal force on a patch with a centre, over the soft limit.
+TAXELS_LEAST = 1e-3
+# Maps of the known surface in an observation.
+SURFACE_MAPS = ("face_map", "height_map", "thickness_map")
 # Speed at which the tip slows down before a place: the distance left is covered in this time [control steps].
 SLOWING = 4.0
 # Least depth of a reading [tip radii], and least force over the soft limit.
@@ -30,27 +42,28 @@ MAP_STEPS = 10
 
 
 class SlideMemory:
-    """Readings of a slide on the sites of a map.
+    """Readings of a slide on the sites of a map: a spatial memory of fixed size.
 
     Fields:
         map: of the sites
-        place: of the tip now [tip radii]                                                                   (2,)
-        height, thickness: of the known surface at each site [tip radii]; None without                      (n_site,)
-        sums: of the readings at each site: number, log stiffness, normal force, depth, centre of pressure
-            along both axes, spread of the pressure, shear along both axes                                   (9, n_site)
+        place: of the tip now [tip radii]                                                                    (2,)
+        touching: True if it has a reading now
+        surface: maps of the known surface (face, height and thickness in tip radii); none without   (3 or 0, n_site)
+        sums: of the readings at each site: number, log stiffness, normal force, depth, force (3) on the face's
+            axes over the soft limit, forces on the taxels likewise, row by row                           (n, n_site)
     """
 
     def __init__(self, slices: dict[str, slice], observation: NDArray[np.floating]) -> None:
         """Begin an episode with its first observation."""
         self._slices = slices
         cell, share = (self._read(observation, name) for name in ("map_cell", "chart_share"))
-        face = self._read(observation, "face_map") > 0.5 if "face_map" in slices else np.ones(MAP_SIDE**2, dtype=bool)
+        known = [self._read(observation, name) for name in SURFACE_MAPS if name in slices]
+        self.surface = np.array(known).reshape(-1, MAP_SIDE * MAP_SIDE)
+        face = self.surface[0] > 0.5 if known else np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_)
         self.map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)
-        self.height, self.thickness = (
-            self._read(observation, name) if name in slices else None for name in ("height_map", "thickness_map")
-        )
-        self.sums = np.zeros((9, MAP_SIDE * MAP_SIDE))
-        self.steps = 0
+        taxels = slices.get("taxels", slice(0, 0))
+        self.sums = np.zeros((7 + taxels.stop - taxels.start, MAP_SIDE * MAP_SIDE))
+        self.steps, self.touching = 0, False
         self.add(observation)
 
     def _read(self, observation: NDArray[np.floating], name: str) -> FloatArray:
@@ -64,15 +77,13 @@ class SlideMemory:
         site = int(self.map.nearest(on_chart))
         force, normal = (self._read(observation, name) for name in ("contact_force", "surface_normal"))
         depth, push = float(self._read(observation, "tip_depth")[0]), float(force @ normal)
-        if site < 0 or depth < DEPTH_LEAST or push < FORCE_LEAST:
+        self.touching = site >= 0 and depth >= DEPTH_LEAST and push >= FORCE_LEAST
+        if not self.touching:
             return
-        features = np.zeros(9)
         # Hertz (1881): the force on a half space grows with depth^1.5.
-        features[:4] = 1.0, math.log(push) - 1.5 * math.log(depth), push, depth
-        if "taxels" in self._slices:
-            features[4:7] = pressure_moments(self._read(observation, "taxels"))
-        features[7:] = force[:2]
-        self.sums[:, site] += features
+        stiffness = math.log(push) - 1.5 * math.log(depth)
+        taxels = self._read(observation, "taxels") if "taxels" in self._slices else np.zeros(0)
+        self.sums[:, site] += np.concatenate([[1.0, stiffness, push, depth], force, taxels])
 
     @property
     def visited(self) -> NDArray[np.intp]:
@@ -81,20 +92,29 @@ class SlideMemory:
 
     @property
     def means(self) -> FloatArray:
-        """Mean readings of the visited sites, without their number, (8, n_visited)."""
+        """Mean readings of the visited sites, without their number, (n - 1, n_visited)."""
         sums = self.sums[:, self.visited]
         return sums[1:] / sums[0]
 
 
-def pressure_moments(taxels: FloatArray) -> FloatArray:
-    """Centre along both axes and mean square distance from it of the pressure on 4 x 4 taxels, in taxels, (3,)."""
-    push = np.maximum(taxels.reshape(-1, 3)[:, 2], 0.0)
+def pressure_centres(taxels: FloatArray) -> FloatArray:
+    """Centres of the normal force on square patches of taxels (3 m, n), along both axes, in taxels, (n, 2)."""
+    push = np.maximum(taxels.reshape(-1, 3, taxels.shape[1])[:, 2], 0.0)
     side = math.isqrt(len(push))
     rows, columns = np.divmod(np.arange(len(push)), side)
     places = np.stack([columns, rows]) - 0.5 * (side - 1)
-    total = max(float(push.sum()), 1e-6)
-    centre = places @ push / total
-    return np.append(centre, float((np.square(places - centre[:, None]).sum(axis=0) * push).sum()) / total)
+    return (places @ push / np.maximum(push.sum(axis=0), TAXELS_LEAST)).T
+
+
+def less_surface(memory: SlideMemory, values: FloatArray) -> FloatArray:
+    """Values at the visited sites (n, k) less their least-squares fit by slope and thickness of the known surface."""
+    _, height, thickness = memory.surface
+    slopes = np.gradient(height.reshape(MAP_SIDE, MAP_SIDE), memory.map.cell)
+    along, across = (slope.ravel()[memory.visited] for slope in slopes)
+    columns = [np.ones(len(values)), across, along, across**2 + along**2, 1.0 / thickness[memory.visited]]
+    # As many readings as unknowns would be fitted exactly.
+    table = np.stack(columns[: 1 if len(values) < 30 else None], axis=1)
+    return values - table @ np.linalg.lstsq(table, values, rcond=None)[0]
 
 
 # ---- ways over the face ----------------------------------------------------------------------------------------------
@@ -125,7 +145,9 @@ def spiral(touch_map: TouchMap, spacing: float) -> FloatArray:
     away = sites - middle
     angle = np.arctan2(away[:, 1], away[:, 0])
     sectors = np.linspace(-math.pi, math.pi, 17)[:-1]
-    reach = [np.linalg.norm(away[np.abs((angle - at + math.pi) % (2 * math.pi) - math.pi) < 0.4], axis=1) for at in sectors]
+    reach = [
+        np.linalg.norm(away[np.abs((angle - at + math.pi) % (2 * math.pi) - math.pi) < 0.4], axis=1) for at in sectors
+    ]
     border = np.array([lengths.max(initial=0.0) for lengths in reach])
     turns = max(1, math.ceil(border.min() / spacing))
     share = 1.0 - (np.arange(16 * turns) + 8.0) / (16 * turns + 8.0)
@@ -153,3 +175,135 @@ class Way:
             self.goal = next(self._left, None)
             self._nearest, self._waited = math.inf, 0
         return np.zeros(2)
+
+
+# ---- agents ----------------------------------------------------------------------------------------------------------
+
+
+def lesion_rows(places: FloatArray, radii: FloatArray, extent: FloatArray) -> FloatArray:
+    """The declaration of up to three lesions at places (k, 2) with radii (k,), all in tip radii, as an action (12,)."""
+    rows = np.full((3, 4), -1.0)
+    count = min(len(places), len(rows))
+    rows[:count, 0] = 1.0
+    rows[:count, 1:3] = np.clip(2.0 * places[:count] / extent - 1.0, -1.0, 1.0)
+    rows[:count, 3] = np.clip(radii[:count] - 1.0, -1.0, 1.0)
+    return rows.ravel()
+
+
+class SlideSweep:
+    """Slides along a boustrophedon with one set point of the force, and maps by a Gaussian process.
+
+    The process (`LesionEstimator`) reads the log of the force over depth^1.5, less a least-squares fit by the thickness
+    and the slope of the known surface.
+    """
+
+    reads_taxels: ClassVar[bool] = False
+
+    def reset(self, rng: np.random.Generator, facts: Any) -> None:
+        """Begin an episode."""
+        self.slices, self.memory = facts.observation_slices, None
+        self.declared = np.full(LESIONS_MOST * LESION_NUMBERS, -1.0)
+
+    def places(self, memory: SlideMemory) -> FloatArray:
+        """Places to slide through [tip radii], (n, 2)."""
+        return sweep(memory.map, ROW_SPACING)
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The next action."""
+        if self.memory is None:
+            self.memory = SlideMemory(self.slices, observation)
+            self.way = Way(self.places(self.memory))
+        else:
+            self.memory.add(observation)
+        if self.memory.steps % MAP_STEPS == 0:
+            self.declared = self.declare(self.memory)
+        slide = np.clip(self.way.velocity(self.memory.place), -1.0, 1.0)
+        return np.concatenate([slide, [PRESS], self.declared]).astype(np.float32)
+
+    def declare(self, memory: SlideMemory) -> FloatArray:
+        """The declared map as numbers of an action."""
+        points = self.estimate(memory).points
+        return lesion_numbers(points, np.full(len(points), LESION_RADIUS), memory.map.extent)
+
+    def estimate(self, memory: SlideMemory) -> LesionEstimate:
+        """Lesions by the Gaussian process, lengths in tip radii."""
+        estimator = LesionEstimator(
+            memory.map.extent,
+            lesion_radius=LESION_RADIUS,
+            noise=READING_NOISE,
+            map_spread=HEALTHY_SPREAD,
+            gradient_noise=GRADIENT_NOISE * self.reads_taxels,
+        )
+        means = memory.means
+        gradients = GRADIENT_GAIN * less_surface(memory, pressure_centres(means[6:])) if self.reads_taxels else None
+        return estimator.estimate(memory.map.sites[memory.visited], less_surface(memory, means[:1].T)[:, 0], gradients)
+
+
+class SlideSweepTaxels(SlideSweep):
+    """As `SlideSweep`; the process also reads the centre of pressure on the taxels, less its fit, as its gradient."""
+
+    reads_taxels = True
+
+
+class SlideSpiral(SlideSweep):
+    """As `SlideSweep`, along a spiral."""
+
+    def places(self, memory: SlideMemory) -> FloatArray:
+        """Places to slide through [tip radii], (n, 2)."""
+        return spiral(memory.map, ROW_SPACING)
+
+
+class SlideOracle(SlideSweep):
+    """Slides from lesion to lesion, the nearest next, and declares each as it is when the tip is over it."""
+
+    sees_truth: ClassVar[bool] = True
+
+    def see(self, task: SlideTask) -> None:
+        """Take the truth of the episode, after `reset`."""
+        chart, radius = task.charted.chart, task.charted.tip_radius
+        centres = np.array([lesion.centre for lesion in task.lesions]).reshape(-1, 3)
+        self.lesions = 0.5 * (chart.place(centres) + 1.0) * chart.extent / radius
+        self.radii = np.array([lesion.radius for lesion in task.lesions]) / radius
+        self.touched: list[int] = []
+
+    def places(self, memory: SlideMemory) -> FloatArray:
+        """The lesions, each the nearest to the one before (k, 2)."""
+        place, left, ways = memory.place, list(range(len(self.lesions))), []
+        while left:
+            nearest = min(left, key=lambda lesion: float(np.linalg.norm(self.lesions[lesion] - place)))
+            left.remove(nearest)
+            place = self.lesions[nearest]
+            ways.append(place)
+        return np.array(ways).reshape(-1, 2)
+
+    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The next action."""
+        action = super().act(observation)
+        assert self.memory is not None
+        away = np.linalg.norm(self.lesions - self.memory.place, axis=1)
+        near = np.flatnonzero(away < REACHED).tolist() if self.memory.touching else []
+        self.touched += [lesion for lesion in near if lesion not in self.touched]
+        action[3:] = lesion_numbers(self.lesions[self.touched], self.radii[self.touched], self.memory.map.extent)
+        return action
+
+    def declare(self, memory: SlideMemory) -> FloatArray:
+        """Nothing by itself."""
+        return self.declared
+
+
+def lesion_numbers(places: FloatArray, radii: FloatArray, extent: FloatArray) -> FloatArray:
+    """The declaration of lesions at places (k, 2) with radii (k,), all in tip radii, as numbers of an action."""
+    rows = np.full((LESIONS_MOST, LESION_NUMBERS), -1.0)
+    count = min(len(places), LESIONS_MOST)
+    rows[:count, 0] = 1.0
+    rows[:count, 1:3] = np.clip(2.0 * places[:count] / extent - 1.0, -1.0, 1.0)
+    rows[:count, 3] = np.clip(radii[:count] - 1.0, -1.0, 1.0)
+    return rows.ravel()
+
+
+SLIDES: dict[str, type[SlideSweep]] = {
+    "slide_sweep": SlideSweep,
+    "slide_sweep_taxels": SlideSweepTaxels,
+    "slide_spiral": SlideSpiral,
+    "slide_oracle": SlideOracle,
+}

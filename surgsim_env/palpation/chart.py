@@ -270,7 +270,7 @@ class ChartedFace:
 
     @cached_property
     def heights(self) -> FloatArray:
-        """Heights of the surface against the approach at the touch map's sites, from the highest point [m], (n_site,)."""
+        """Heights of the surface at the touch map's sites over the face's highest point [m], at most 0, (n_site,)."""
         outward = -self.face.approach
         top = float(matmul(self.face.points[self.face.triangles], outward).max())
         return matmul(self.surface(self.touch_map.places), outward) - top

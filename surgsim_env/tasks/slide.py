@@ -1,17 +1,16 @@
 """Palpation by a sliding, tactile tip: a map of hidden lesions within a time, without a healthy map."""
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
-from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.face_frame import FaceFrame
+from surgsim_env.palpation.lesion_estimator import LESIONS_MOST
 from surgsim_env.palpation.scores import dice, ospa, ospa_cutoff
 from surgsim_env.scene.levels import REFERENCE_TIP
 from surgsim_env.tasks.channels import SPEED_BOUND, TAXELS, TIME_LEFT, force_scale, soft_force_share
@@ -30,8 +29,8 @@ NORMAL_SPEED, LIFT_HEIGHT = 2.0, 0.5
 # Share of the force's error that a control step takes away on tissue as stiff as soft limit over press depth. Tissue
 # over a lesion is up to twice as stiff: 1 would overshoot there.
 FORCE_GAIN = 0.4
-# Lesions of a declared map, and numbers of each: presence, place (2) and radius.
-LESIONS_MOST, LESION_NUMBERS = 3, 4
+# Numbers of a declared lesion: presence, place (2) and radius.
+LESION_NUMBERS = 4
 # Bounds of the tip's place on the chart, of lengths over the tip's radius, and of the thickness observed.
 PLACE_BOUND, LENGTH_BOUND, THICKNESS_BOUND = 100.0, 1000.0, 20.0
 # Gap of the tip above the surface at the start [m].
@@ -168,7 +167,9 @@ class SlideTask(Task):
         ),
         Channel(
             "thickness_map", _on_map, "", 0.0, THICKNESS_BOUND,
-            read=lambda task, simulation: np.minimum(task.charted.thicknesses / task.charted.tip_radius, THICKNESS_BOUND),
+            read=lambda task, simulation: np.minimum(
+                task.charted.thicknesses / task.charted.tip_radius, THICKNESS_BOUND
+            ),
             meaning="with `surface`: thickness of the organ there over the tip's radius, at most 20",
             size_text="n n or 0",
         ),
@@ -184,7 +185,7 @@ class SlideTask(Task):
             "largest force of the step, 0 at the soft and 1 at the hard limit, over the number of control steps",
             lambda task, step: soft_force_share(task, step) / task.episode_steps,
         ),
-        Reward("hard_force", -0.5, "failure", "the force exceeded the hard limit, or tissue was damaged: a safety stop"),
+        Reward("hard_force", -0.5, "failure", "the force exceeded the hard limit: a safety stop"),
         Reward("fault", -0.5, "failure", "the simulation could not go on"),
     )  # fmt: skip
     setup = Setup(scene="liver_family", instrument="tactile_probe", level="clinical", episode_steps=None)

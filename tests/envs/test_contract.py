@@ -26,6 +26,7 @@ IDS = [*sorted(env_id for env_id in gym.registry if env_id.startswith("SurgSim/"
 SETTINGS = {
     "SurgSim/Palpate-v0": {"scene": "phantom_small"},
     "SurgSim/PalpateSites-v0": {"scene": "phantom_small", "budget": 20},
+    "SurgSim/Slide-v0": {"scene": "phantom_small"},
 }
 SHORTER = {"SurgSim/PalpateSites-v0": 5, "SurgSim/Retract-v0": 2, "SurgSim/BimanualRetract-v0": 2}
 # Every id with its scene's own instrument, and some with an arm.

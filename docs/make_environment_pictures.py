@@ -88,7 +88,7 @@ def film_presses(path: Path, *, seed: int) -> None:
 
 def film_slide(path: Path, *, seed: int) -> None:
     """A sweep over a liver, with the pressure on its surface."""
-    env = Filmed(make("SurgSim/Slide-v0", surface=True, show_lesion=True), ("overview",), 8)
+    env = Filmed(make("SurgSim/Slide-v0", face=True, show_lesion=True), ("overview",), 8)
     agent, over = SlideSweep(), False
     observation, _ = env.reset(seed=seed)
     agent.reset(np.random.default_rng(seed), episode_facts(env, "SurgSim/Slide-v0", {}))

@@ -106,11 +106,11 @@ class TaskAgent:
 
 
 def _slide(make: Callable[[], Any]) -> TaskAgent:
-    """An agent of SurgSim/Slide-v0 that observes the known surface."""
+    """An agent of SurgSim/Slide-v0 that observes the map of the pressable sites."""
     return TaskAgent(
         SLIDE,
         lambda kwargs: AgentActor(make, lambda env: episode_facts(env, SLIDE, kwargs)),
-        {"surface": True},
+        {"face": True},
         sees_truth(make()),
     )
 

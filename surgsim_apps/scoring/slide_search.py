@@ -20,17 +20,18 @@ LESION_NUMBERS = 4
 
 # Set point of the scripts' force over the soft limit, and distance between the rows of a sweep [tip radii].
 PRESS, ROW_SPACING = 0.5, 1.8
+# Ranges of both for random slides, and number of their random places.
+PRESSES, ROW_SPACINGS, RANDOM_PLACES = (0.35, 0.7), (1.3, 2.6), 60
 # A place of the way counts as reached this near [tip radii]; it is left out after so many control steps without
 # progress.
 REACHED, PATIENCE = 0.5, 10
-# Deviation of a site's log stiffness by the sensor, and that of healthy tissue about the fit by the surface.
-READING_NOISE, HEALTHY_SPREAD = 0.1, 0.1
-# Gradient of the log stiffness per centre of pressure [1 / (tip radius taxel)], and its deviation [1 / tip radius].
-GRADIENT_GAIN, GRADIENT_NOISE = 1.0, 0.5
+# Deviation of a site's log stiffness about the fit by the surface; the gradient of the log stiffness per centre of
+# pressure [1 / (tip radius taxel)], and its deviation [1 / tip radius]: chosen on the training split of `liver_family`.
+READING_NOISE, GRADIENT_GAIN, GRADIENT_NOISE = 0.12, 1.0, 1.0
 # Least normal force on a patch with a centre, over the soft limit.
 TAXELS_LEAST = 1e-3
-# Maps of the known surface in an observation.
-SURFACE_MAPS = ("face_map", "height_map", "thickness_map")
+# Readings needed for a fit by the surface.
+READINGS_LEAST = 30
 # Speed at which the tip slows down before a place: the distance left is covered in this time [control steps].
 SLOWING = 4.0
 # Least depth of a reading [tip radii], and least force over the soft limit.
@@ -45,45 +46,49 @@ class SlideMemory:
     """Readings of a slide on the sites of a map: a spatial memory of fixed size.
 
     Fields:
-        map: of the sites
-        place: of the tip now [tip radii]                                                                    (2,)
-        touching: True if it has a reading now
-        surface: maps of the known surface (face, height and thickness in tip radii); none without   (3 or 0, n_site)
-        sums: of the readings at each site: number, log stiffness, normal force, depth, force (3) on the face's
-            axes over the soft limit, forces on the taxels likewise, row by row                           (n, n_site)
+        map: of the sites; all on the chart are pressable where the observation has no `face_map`
+        place: of the tip now [tip radii]                                                                  (2,)
+        site: of the reading now; -1 for a tip that hardly touches
+        reading: the last: 1, log stiffness, normal force, depth, force (3) over the soft limit and surface normal (3)
+            on the face's axes, thickness, forces on the taxels likewise                                         (n,)
+        sums: of the readings at each site                                                                (n, n_site)
+        steps: control steps so far
     """
 
     def __init__(self, slices: dict[str, slice], observation: NDArray[np.floating]) -> None:
         """Begin an episode with its first observation."""
         self._slices = slices
         cell, share = (self._read(observation, name) for name in ("map_cell", "chart_share"))
-        known = [self._read(observation, name) for name in SURFACE_MAPS if name in slices]
-        self.surface = np.array(known).reshape(-1, MAP_SIDE * MAP_SIDE)
-        face = self.surface[0] > 0.5 if known else np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_)
+        face = np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_)
         self.map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)
-        taxels = slices.get("taxels", slice(0, 0))
-        self.sums = np.zeros((7 + taxels.stop - taxels.start, MAP_SIDE * MAP_SIDE))
-        self.steps, self.touching = 0, False
+        face &= (np.abs(self.map.places) <= 1.0).all(axis=1)
+        if "face_map" in slices:
+            face &= self._read(observation, "face_map") > 0.5
+        self.reading = np.zeros(11 + len(self._taxels(observation)))
+        self.sums = np.zeros((len(self.reading), MAP_SIDE * MAP_SIDE))
+        self.steps = 0
         self.add(observation)
 
     def _read(self, observation: NDArray[np.floating], name: str) -> FloatArray:
         return np.asarray(observation[self._slices[name]], dtype=np.float64)
+
+    def _taxels(self, observation: NDArray[np.floating]) -> FloatArray:
+        return self._read(observation, "taxels") if "taxels" in self._slices else np.zeros(0)
 
     def add(self, observation: NDArray[np.floating]) -> None:
         """Add the reading of a control step."""
         self.steps += 1
         on_chart = self._read(observation, "place")
         self.place = 0.5 * (on_chart + 1.0) * self.map.extent
-        site = int(self.map.nearest(on_chart))
         force, normal = (self._read(observation, name) for name in ("contact_force", "surface_normal"))
         depth, push = float(self._read(observation, "tip_depth")[0]), float(force @ normal)
-        self.touching = site >= 0 and depth >= DEPTH_LEAST and push >= FORCE_LEAST
-        if not self.touching:
-            return
-        # Hertz (1881): the force on a half space grows with depth^1.5.
-        stiffness = math.log(push) - 1.5 * math.log(depth)
-        taxels = self._read(observation, "taxels") if "taxels" in self._slices else np.zeros(0)
-        self.sums[:, site] += np.concatenate([[1.0, stiffness, push, depth], force, taxels])
+        self.site = int(self.map.nearest(on_chart)) if depth >= DEPTH_LEAST and push >= FORCE_LEAST else -1
+        if self.site >= 0:
+            # Hertz (1881): the force on a half space grows with depth^1.5.
+            numbers = [1.0, math.log(push) - 1.5 * math.log(depth), push, depth]
+            rest = (force, normal, self._read(observation, "thickness"), self._taxels(observation))
+            self.reading = np.concatenate([numbers, *rest])
+            self.sums[:, self.site] += self.reading
 
     @property
     def visited(self) -> NDArray[np.intp]:
@@ -106,14 +111,17 @@ def pressure_centres(taxels: FloatArray) -> FloatArray:
     return (places @ push / np.maximum(push.sum(axis=0), TAXELS_LEAST)).T
 
 
-def less_surface(memory: SlideMemory, values: FloatArray) -> FloatArray:
-    """Values at the visited sites (n, k) less their least-squares fit by slope and thickness of the known surface."""
-    _, height, thickness = memory.surface
-    slopes = np.gradient(height.reshape(MAP_SIDE, MAP_SIDE), memory.map.cell)
-    along, across = (slope.ravel()[memory.visited] for slope in slopes)
-    columns = [np.ones(len(values)), across, along, across**2 + along**2, 1.0 / thickness[memory.visited]]
+def less_surface(means: FloatArray, values: FloatArray) -> FloatArray:
+    """Values at the visited sites (n, k) less their least-squares fit by slope and thickness of the known surface.
+
+    Args:
+        means: of the readings at these sites (`SlideMemory.means`).
+        values: (n, k).
+    """
+    across, along, outward, thickness = means[6:10]
+    columns = [np.ones(len(values)), across, along, outward, 1.0 / np.maximum(thickness, 1.0)]
     # As many readings as unknowns would be fitted exactly.
-    table = np.stack(columns[: 1 if len(values) < 30 else None], axis=1)
+    table = np.stack(columns[: 1 if len(values) < READINGS_LEAST else None], axis=1)
     return values - table @ np.linalg.lstsq(table, values, rcond=None)[0]
 
 
@@ -202,7 +210,7 @@ class SlideSweep:
     def reset(self, rng: np.random.Generator, facts: Any) -> None:
         """Begin an episode."""
         self.slices, self.memory = facts.observation_slices, None
-        self.declared = np.full(LESIONS_MOST * LESION_NUMBERS, -1.0)
+        self.declared, self.press = np.full(LESIONS_MOST * LESION_NUMBERS, -1.0), PRESS
 
     def places(self, memory: SlideMemory) -> FloatArray:
         """Places to slide through [tip radii], (n, 2)."""
@@ -218,7 +226,7 @@ class SlideSweep:
         if self.memory.steps % MAP_STEPS == 0:
             self.declared = self.declare(self.memory)
         slide = np.clip(self.way.velocity(self.memory.place), -1.0, 1.0)
-        return np.concatenate([slide, [PRESS], self.declared]).astype(np.float32)
+        return np.concatenate([slide, [self.press], self.declared]).astype(np.float32)
 
     def declare(self, memory: SlideMemory) -> FloatArray:
         """The declared map as numbers of an action."""
@@ -231,12 +239,11 @@ class SlideSweep:
             memory.map.extent,
             lesion_radius=LESION_RADIUS,
             noise=READING_NOISE,
-            map_spread=HEALTHY_SPREAD,
             gradient_noise=GRADIENT_NOISE * self.reads_taxels,
         )
         means = memory.means
-        gradients = GRADIENT_GAIN * less_surface(memory, pressure_centres(means[6:])) if self.reads_taxels else None
-        return estimator.estimate(memory.map.sites[memory.visited], less_surface(memory, means[:1].T)[:, 0], gradients)
+        gradients = GRADIENT_GAIN * less_surface(means, pressure_centres(means[10:])) if self.reads_taxels else None
+        return estimator.estimate(memory.map.sites[memory.visited], less_surface(means, means[:1].T)[:, 0], gradients)
 
 
 class SlideSweepTaxels(SlideSweep):
@@ -251,6 +258,31 @@ class SlideSpiral(SlideSweep):
     def places(self, memory: SlideMemory) -> FloatArray:
         """Places to slide through [tip radii], (n, 2)."""
         return spiral(memory.map, ROW_SPACING)
+
+
+class SlideRandom(SlideSweep):
+    """Slides along a random sweep, a spiral or through random places with a random force, and maps nothing.
+
+    For recordings, and as the plainest agent.
+    """
+
+    def reset(self, rng: np.random.Generator, facts: Any) -> None:
+        """Begin an episode."""
+        super().reset(rng, facts)
+        self.rng, self.press = rng, float(rng.uniform(*PRESSES))
+
+    def places(self, memory: SlideMemory) -> FloatArray:
+        """Places to slide through [tip radii], (n, 2)."""
+        rng, kind, spacing = self.rng, self.rng.random(), float(self.rng.uniform(*ROW_SPACINGS))
+        if kind < 0.5:
+            return sweep(memory.map, spacing, flip=rng.random() < 0.5, down=rng.random() < 0.5)
+        if kind < 0.7:
+            return spiral(memory.map, spacing)
+        return memory.map.sites[rng.choice(np.flatnonzero(memory.map.pressable), size=RANDOM_PLACES)]
+
+    def declare(self, memory: SlideMemory) -> FloatArray:
+        """Nothing."""
+        return self.declared
 
 
 class SlideOracle(SlideSweep):
@@ -281,7 +313,7 @@ class SlideOracle(SlideSweep):
         action = super().act(observation)
         assert self.memory is not None
         away = np.linalg.norm(self.lesions - self.memory.place, axis=1)
-        near = np.flatnonzero(away < REACHED).tolist() if self.memory.touching else []
+        near = np.flatnonzero(away < REACHED).tolist() if self.memory.site >= 0 else []
         self.touched += [lesion for lesion in near if lesion not in self.touched]
         action[3:] = lesion_numbers(self.lesions[self.touched], self.radii[self.touched], self.memory.map.extent)
         return action
@@ -302,6 +334,7 @@ def lesion_numbers(places: FloatArray, radii: FloatArray, extent: FloatArray) ->
 
 
 SLIDES: dict[str, type[SlideSweep]] = {
+    "slide_random": SlideRandom,
     "slide_sweep": SlideSweep,
     "slide_sweep_taxels": SlideSweepTaxels,
     "slide_spiral": SlideSpiral,

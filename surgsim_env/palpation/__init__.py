@@ -12,7 +12,7 @@ from surgsim_env.palpation.lesion_estimator import (
     strongest_apart,
 )
 from surgsim_env.palpation.member_chart import member_map, still_template
-from surgsim_env.palpation.scores import CUTOFF, FOUND_SHARE, matched_distances, ospa, ospa_cutoff
+from surgsim_env.palpation.scores import CUTOFF, FOUND_SHARE, dice, matched_distances, ospa, ospa_cutoff
 from surgsim_env.palpation.site_press import (
     HOLD_TIME,
     PRESS_SPEED,
@@ -43,6 +43,7 @@ __all__ = [
     "SitePress",
     "TouchMap",
     "contrast_process",
+    "dice",
     "healthy_file",
     "interpolated",
     "matched_distances",

@@ -269,18 +269,6 @@ class ChartedFace:
         return interpolated(self._surface, places)
 
     @cached_property
-    def heights(self) -> FloatArray:
-        """Heights of the surface at the touch map's sites over the face's highest point [m], at most 0, (n_site,)."""
-        outward = -self.face.approach
-        top = float(matmul(self.face.points[self.face.triangles], outward).max())
-        return matmul(self.surface(self.touch_map.places), outward) - top
-
-    @cached_property
-    def thicknesses(self) -> FloatArray:
-        """Thickness of the organ below the surface at the touch map's sites [m], (n_site,)."""
-        return np.array([self.face.below(point)[2] for point in self.surface(self.touch_map.places)])
-
-    @cached_property
     def _surface(self) -> FloatArray:
         side = POINTS_BETWEEN * (self.chart.side_count - 1) + 1
         axis = np.linspace(-1.0, 1.0, side)

@@ -1,6 +1,7 @@
 """Palpation by a sliding, tactile tip: a map of hidden lesions within a time, without a healthy map."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from surgsim_env.palpation.face_frame import FaceFrame
 from surgsim_env.palpation.lesion_estimator import LESIONS_MOST
 from surgsim_env.palpation.scores import dice, ospa, ospa_cutoff
 from surgsim_env.scene.levels import REFERENCE_TIP
+from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.model import Scene
 from surgsim_env.tasks.channels import SPEED_BOUND, TAXELS, TIME_LEFT, force_scale, soft_force_share
 from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward, Setup
 from surgsim_env.tasks.palpate_sites import CELL_BOUND, SUCCESS_ERROR
@@ -29,20 +32,28 @@ NORMAL_SPEED, LIFT_HEIGHT = 2.0, 0.5
 # Share of the force's error that a control step takes away on tissue as stiff as soft limit over press depth. Tissue
 # over a lesion is up to twice as stiff: 1 would overshoot there.
 FORCE_GAIN = 0.4
-# Numbers of a declared lesion: presence, place (2) and radius.
-LESION_NUMBERS = 4
+# Numbers of a declared lesion.
+LESION_NUMBERS = ("presence", "across", "along", "radius")
 # Bounds of the tip's place on the chart, of lengths over the tip's radius, and of the thickness observed.
 PLACE_BOUND, LENGTH_BOUND, THICKNESS_BOUND = 100.0, 1000.0, 20.0
 # Gap of the tip above the surface at the start [m].
 START_GAP = 0.003
+# Largest dose of the tissue where the scene states none [Pa s].
+DOSE = math.inf
 
 
 def _tip_radius(task: "SlideTask", instrument: Instrument | None) -> float:
     return task.anatomy.scene.instrument.tip_radius
 
 
+def load_slide_scene(scene: str) -> Scene:
+    """Scene of a name or file, with the dose limit DOSE where it has none."""
+    made = make_scene(scene)
+    return made if made.limits.dose is not None else replace(made, limits=replace(made.limits, dose=DOSE))
+
+
 def _on_map(task: "SlideTask") -> int:
-    return MAP_SIDE * MAP_SIDE if task.surface else 0
+    return MAP_SIDE * MAP_SIDE if task.shows_face else 0
 
 
 class SlideTask(Task):
@@ -63,9 +74,9 @@ class SlideTask(Task):
     and radius, (1 + value) tip radii.
 
     ## Observation Space
-    `Box(float32)`, all bounds finite. An instrument with 4 x 4 taxels gives 48 numbers more. Without `surface`, the
-    last reading alone: a POMDP, for agents with a memory of their own. Where the patient breathes, the tip's place is
-    relative to the moving surface, as markers show it.
+    `Box(float32)`, all bounds finite; 48 numbers are of 4 x 4 taxels. It is the last reading alone: a POMDP, for agents
+    with a memory of their own. Where the patient breathes, the tip's place is relative to the moving surface, as
+    markers show it.
 
     ## Rewards
     `info["reward_<term>"]` shows what each term paid. The return is the mean over the time of the map's score, less the
@@ -85,15 +96,16 @@ class SlideTask(Task):
     `is_success` (bool), `force_peak` [N], `cost` (force above the soft limit, 1 at the hard one), `error_mm` (OSPA of
     the declared map; -1 after a reset), `dice`, `map_score` (mean score so far; 0 after a reset), `path_length` [m] in
     contact, `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. `member` (str) where the scene is a family;
-    `tissue_pressure` [Pa], `tissue_strain` and more as for `SurgSim/PalpateSites-v0`.
+    `tissue_pressure` [Pa], `tissue_strain` and more as for `SurgSim/PalpateSites-v0`. In the last step the true map,
+    as `lesions` of the action would declare it: `lesion_1_presence`, `lesion_1_across`, `lesion_1_along`,
+    `lesion_1_radius` and so on, before that and for lesions that are not there -1.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "liver_family".
     * `instrument`: default "tactile_probe"; or "probe", the name of an arm or the path of an arm's TOML file.
     * `level`: "easy", "standard", "hard" or "clinical" (default).
     * `motion`: "none", "calm" or "free"; by default as the level says: "calm" for "clinical".
-    * `surface`: observe maps of the known surface (pressable sites, height, thickness), the same in every step of an
-      episode; default False.
+    * `face`: observe the map of the pressable sites, the same in every step of an episode; default False.
     * `episode_steps`: control steps of an episode; default 400.
     * `split`: "train" (default), "validation" or "test": members of a family of organs, of which each episode draws
       one; `info["member"]` names it.
@@ -107,7 +119,7 @@ class SlideTask(Task):
         Command("press", 1, meaning="set point of the normal force over the soft limit; below 0: lift the tip"),
         Command(
             "lesions",
-            LESIONS_MOST * LESION_NUMBERS,
+            LESIONS_MOST * len(LESION_NUMBERS),
             meaning="the declared map: presence, place on the chart (2) and radius of each lesion",
         ),
     )
@@ -156,22 +168,8 @@ class SlideTask(Task):
         TAXELS,
         Channel(
             "face_map", _on_map, "", 0.0, 1.0, read=lambda task, simulation: task.charted.touch_map.pressable,
-            meaning="with `surface`: 1 for each site that may be pressed, on a map of n x n sites as "
+            meaning="with `face`: 1 for each site that may be pressed, on a map of n x n sites as "
             "`SurgSim/PalpateSites-v0` has", size_text="n n or 0",
-        ),
-        Channel(
-            "height_map", _on_map, "", -LENGTH_BOUND, LENGTH_BOUND,
-            read=lambda task, simulation: task.charted.heights / task.charted.tip_radius,
-            meaning="with `surface`: height of the registered surface at each site over the tip's radius, from the "
-            "face's highest point", size_text="n n or 0",
-        ),
-        Channel(
-            "thickness_map", _on_map, "", 0.0, THICKNESS_BOUND,
-            read=lambda task, simulation: np.minimum(
-                task.charted.thicknesses / task.charted.tip_radius, THICKNESS_BOUND
-            ),
-            meaning="with `surface`: thickness of the organ there over the tip's radius, at most 20",
-            size_text="n n or 0",
         ),
     )  # fmt: skip
     # A control step costs at most 0.25 / n: to go on after a safety stop would always have paid more than -0.5.
@@ -188,13 +186,19 @@ class SlideTask(Task):
         Reward("hard_force", -0.5, "failure", "the force exceeded the hard limit: a safety stop"),
         Reward("fault", -0.5, "failure", "the simulation could not go on"),
     )  # fmt: skip
-    setup = Setup(scene="liver_family", instrument="tactile_probe", level="clinical", episode_steps=None)
+    setup = Setup(
+        scene="liver_family",
+        instrument="tactile_probe",
+        level="clinical",
+        episode_steps=None,
+        load=load_slide_scene,
+    )
     kept = (
         *("registration", "declared", "place", "tip_depth", "surface_normal", "thickness", "score_sum", "path_length"),
         "last_tip",
     )
 
-    def __init__(self, scenario: Scenario, *, surface: bool = False, episode_steps: int | None = None) -> None:
+    def __init__(self, scenario: Scenario, *, face: bool = False, episode_steps: int | None = None) -> None:
         """Map the lesions of an anatomy.
 
         Attributes that agents with a view of the truth and scores may read: `truth` (the face's points nearest to the
@@ -202,7 +206,7 @@ class SlideTask(Task):
 
         Args:
             scenario: with a level.
-            surface: observe maps of the known surface.
+            face: observe the map of the pressable sites.
             episode_steps: control steps of an episode.
 
         Raises:
@@ -212,7 +216,7 @@ class SlideTask(Task):
         self.episode_steps = EPISODE_STEPS if episode_steps is None else episode_steps
         if self.episode_steps < 1:
             raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
-        self.surface = surface
+        self.shows_face = face
         self._forget()
         self._chart()
 
@@ -224,7 +228,7 @@ class SlideTask(Task):
 
     def _forget(self) -> None:
         """Begin an episode: nothing is declared."""
-        self.declared = np.full((LESIONS_MOST, LESION_NUMBERS), -1.0)
+        self.declared = np.full((LESIONS_MOST, len(LESION_NUMBERS)), -1.0)
         self.registration, self.place, self.surface_normal = np.zeros(3), np.zeros(2), np.zeros(3)
         self.tip_depth = self.thickness = 0.0
         self.score = self.score_sum = self.error = self.dice = self.path_length = 0.0
@@ -251,7 +255,7 @@ class SlideTask(Task):
 
     def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
         """Slide along the surface toward pressable sites, hold the force along the normal, and keep the map."""
-        self.declared = commands["lesions"].reshape(LESIONS_MOST, LESION_NUMBERS).copy()
+        self.declared = commands["lesions"].reshape(LESIONS_MOST, len(LESION_NUMBERS)).copy()
         chart, radius, duration = self.charted.chart, self.charted.tip_radius, self.anatomy.scene.timing.control_step
         here, slide = chart.plane_point(self.place), commands["slide"]
         # Farther ahead than a cell of the map, so that the tip follows a border in place of stopping there.
@@ -329,6 +333,19 @@ class SlideTask(Task):
             "dice": self.dice,
             "map_score": self.score_sum / max(self.step_count, 1),
             "path_length": self.path_length,
+            **self._true_map(shown=bool(end)),
+        }
+
+    def _true_map(self, *, shown: bool) -> dict[str, InfoValue]:
+        """The true map as an action would declare it; -1 if it is not shown."""
+        rows = np.full((LESIONS_MOST, len(LESION_NUMBERS)), -1.0)
+        radius = self.charted.tip_radius
+        for row, lesion in zip(rows, self.lesions if shown else ()):
+            row[:] = 1.0, *self.charted.chart.place(np.array(lesion.centre)), lesion.radius / radius - 1.0
+        return {
+            f"lesion_{number}_{name}": value
+            for number, row in enumerate(rows.tolist(), start=1)
+            for name, value in zip(LESION_NUMBERS, row, strict=True)
         }
 
 

@@ -82,6 +82,10 @@ STILL = {
         ),
         *(f"gradient_map[{entry}]" for entry in range(2 * MAP_SIDE**2)),
     },
+    "SurgSim/Slide-v0": {
+        *(f"surface_normal[{axis}]" for axis in range(3)),
+        *("chart_share[0]", "chart_share[1]", "map_cell[0]", "thickness[0]"),
+    },
     "SurgSim/Retract-v0": HINGE | UNSEEN,
     "SurgSim/BimanualRetract-v0": UNSEEN | {"touch_force[0]", "uncovered[0]"},
 }

@@ -14,6 +14,8 @@ def walk(env, rng):
         elif "TracePath" in env.spec.id:
             action *= (0.2, 0.2, 1.0)  # near the line
             action[2] -= 0.2
+        elif "Slide" in env.spec.id:
+            action[2] = abs(action[2])  # press
         elif "Sites" not in env.spec.id:
             approach = env.unwrapped.scene.instrument.approach
             action[:3] += 0.3 * np.array(approach) / np.linalg.norm(approach)  # press

@@ -93,6 +93,7 @@ VALUES = {
     "split": None,
     "memory": np.True_,
     "frame": "face",
+    "face": True,
     "episode_steps": np.int32(50),
     "budget": np.int64(12),
     "track_motion": False,

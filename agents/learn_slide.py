@@ -1,7 +1,7 @@
 """Learn SurgSim/Slide-v0 from recorded slides: a network that maps lesions and says where to slide next.
 
     ARGS='{"split": "train", "face": true}'
-    python -m agents.record_demonstrations SurgSim/Slide-v0 --by surgsim_apps.scoring.slide_search:SlideRandom \
+    python -m agents.record_demonstrations SurgSim/Slide-v0 --by surgsim_apps.training.slide_agents:SlideRandom \
         --env-arguments "$ARGS" --episodes 256 --keep-failures --dataset surgsim/slide/train-v0
     python -m agents.learn_slide surgsim/slide/train-v0 --check surgsim/slide/validation-v0 --out runs/slide.safetensors
 
@@ -25,7 +25,7 @@ from torch.nn import functional
 import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_apps.scoring.slide_search import LESION_RADIUS, REACHED, SlideMemory
+from surgsim_apps.training.slide_agents import LESION_RADIUS, REACHED, SlideMemory
 from surgsim_apps.training.slide_network import SlideNetwork, declared_lesions, rasterised
 from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, TouchMap, dice, ospa
 
@@ -203,7 +203,7 @@ def train(
             network.eval()
             scores = {least: sum(values) / len(values) for least, values in check(network, checked).items()}
             best = max(scores, key=scores.__getitem__)
-            print(f"step {step}: loss {float(loss):.3f}, check {scores[best]:.3f} at threshold {best}", flush=True)
+            print(f"step {step}: loss {float(loss.detach()):.3f}, check {scores[best]:.3f} at threshold {best}", flush=True)
             network.train()
     return network.eval()
 

@@ -14,7 +14,7 @@ from PIL import Image
 import surgsim_env  # noqa: F401  (registers the environments)
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.episodes import episode_facts
-from surgsim_apps.scoring.slide_search import SlideSweep
+from surgsim_apps.training.slide_agents import SlideSweep
 from surgsim_env.envs import SurgicalEnv
 from surgsim_env.scripting import oracle_script, run_script
 

@@ -46,6 +46,7 @@ from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward,
 from surgsim_env.tasks.palpate import PalpateTask
 from surgsim_env.tasks.palpate_sites import PalpateSitesTask
 from surgsim_env.tasks.retract import RetractTask
+from surgsim_env.tasks.slide import SlideTask
 from surgsim_env.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ __all__ = [
     "Scene",
     "Setup",
     "Simulation",
+    "SlideTask",
     "Support",
     "SurgicalEnv",
     "Task",

@@ -48,8 +48,8 @@ from surgsim_apps.scoring.results import (
     shipped_results,
 )
 from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
-from surgsim_apps.scoring.slide_search import SLIDES
 from surgsim_apps.training.site_agent import site_facts
+from surgsim_apps.training.slide_agents import SLIDES
 from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
 from surgsim_env.step_progress import StepProgress
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
 
-from surgsim_apps.scoring.slide_search import LESION_RADIUS, PRESS, SlideMemory, SlideSweep, Way, lesion_numbers
+from surgsim_apps.training.slide_agents import LESION_RADIUS, PRESS, SlideMemory, SlideSweep, Way, lesion_numbers
 from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE
 from surgsim_env.scene import agents_folder
 

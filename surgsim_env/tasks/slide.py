@@ -38,7 +38,7 @@ LESION_NUMBERS = ("presence", "across", "along", "radius")
 PLACE_BOUND, LENGTH_BOUND, THICKNESS_BOUND = 100.0, 1000.0, 20.0
 # Gap of the tip above the surface at the start [m].
 START_GAP = 0.003
-# Largest dose of the tissue where the scene states none [Pa s].
+# Largest dose of the tissue where the scene states none [Pa s]: some ten times that of a sweep over the face.
 DOSE = math.inf
 
 
@@ -80,8 +80,9 @@ class SlideTask(Task):
 
     ## Rewards
     `info["reward_<term>"]` shows what each term paid. The return is the mean over the time of the map's score, less the
-    cost of force; the score is (1 - OSPA / cutoff + Dice) / 2: of places on the surface (Schuhmacher, Vo & Vo 2008, eq.
-    1, cutoff 2.5 tip radii) and of the discs' areas on the chart (Dice 1945). After a failure nothing more is paid.
+    cost of force; the score is (1 - OSPA / cutoff + Dice) / 2: of places on the chart (Schuhmacher, Vo & Vo 2008, eq.
+    1, cutoff 2.5 tip radii) and of the areas of discs around them (Dice 1945). The true place of a lesion is the
+    surface point nearest to its centre. After a failure nothing more is paid.
 
     ## Starting State
     Drawn from the ranges of the level (`surgsim_env.scene.levels`), as for `SurgSim/PalpateSites-v0`, with the error of
@@ -201,8 +202,8 @@ class SlideTask(Task):
     def __init__(self, scenario: Scenario, *, face: bool = False, episode_steps: int | None = None) -> None:
         """Map the lesions of an anatomy.
 
-        Attributes that agents with a view of the truth and scores may read: `truth` (the face's points nearest to the
-        lesions' centres [m] (n_lesion, 3)), `lesions`, `charted`, `declared`, `error` (OSPA [m]), `dice`.
+        Attributes that agents with a view of the truth and scores may read: `true_map`, `lesions`, `charted`,
+        `declared`, `error` (OSPA [m]), `dice`.
 
         Args:
             scenario: with a level.
@@ -249,9 +250,10 @@ class SlideTask(Task):
         return start.point + start.normal * (self.charted.tip_radius + START_GAP)
 
     @property
-    def truth(self) -> FloatArray:
-        """Points of the face nearest to the lesions' centres [m], (n_lesion, 3)."""
-        return self.drawn.places(self.anatomy)
+    def true_map(self) -> FloatArray:
+        """Places on the chart of the face's points nearest to the lesions' centres, and radii [m], (n_lesion, 3)."""
+        radii = [lesion.radius for lesion in self.lesions]
+        return np.column_stack([self.charted.chart.place(self.drawn.places(self.anatomy)), np.array(radii)])
 
     def command(self, commands: dict[str, FloatArray], instrument: Instrument) -> None:
         """Slide along the surface toward pressable sites, hold the force along the normal, and keep the map."""
@@ -306,14 +308,12 @@ class SlideTask(Task):
 
     def _judge_map(self) -> None:
         """OSPA, Dice and score of the declared map."""
-        chart, radius = self.charted.chart, self.charted.tip_radius
+        chart, radius, truth = self.charted.chart, self.charted.tip_radius, self.true_map
         shown = self.declared[self.declared[:, 0] > 0.0]
-        self.error = ospa(self.truth, self.charted.surface(shown[:, 1:3]), self.cutoff)
+        true_places, places = chart.plane_point(truth[:, :2]), chart.plane_point(shown[:, 1:3])
+        self.error = ospa(true_places, places, self.cutoff)
         sites = chart.lower + self.charted.touch_map.sites
-        centres = np.array([lesion.centre for lesion in self.lesions]).reshape(-1, 3)
-        hidden = _discs(sites, chart.along_axes(centres), np.array([lesion.radius for lesion in self.lesions]))
-        drawn = _discs(sites, chart.plane_point(shown[:, 1:3]), radius * (1.0 + shown[:, 3]))
-        self.dice = dice(hidden, drawn)
+        self.dice = dice(_discs(sites, true_places, truth[:, 2]), _discs(sites, places, radius * (1.0 + shown[:, 3])))
         self.score = 0.5 * (1.0 - self.error / self.cutoff + self.dice)
 
     # ---- judgement --------------------------------------------------------------------------------------------------
@@ -339,9 +339,9 @@ class SlideTask(Task):
     def _true_map(self, *, shown: bool) -> dict[str, InfoValue]:
         """The true map as an action would declare it; -1 if it is not shown."""
         rows = np.full((LESIONS_MOST, len(LESION_NUMBERS)), -1.0)
-        radius = self.charted.tip_radius
-        for row, lesion in zip(rows, self.lesions if shown else ()):
-            row[:] = 1.0, *self.charted.chart.place(np.array(lesion.centre)), lesion.radius / radius - 1.0
+        if shown:
+            for row, (across, along, radius) in zip(rows, self.true_map):
+                row[:] = 1.0, across, along, radius / self.charted.tip_radius - 1.0
         return {
             f"lesion_{number}_{name}": value
             for number, row in enumerate(rows.tolist(), start=1)

@@ -17,6 +17,7 @@ ELSEWHERE = {
     "learn_palpate_organs": "test_organ_agents.py",
     "learn_retract": "test_retract_agents.py",
     "learn_sites": "test_learn_sites.py",
+    "learn_slide": "test_slide_agents.py",
     "leaderboard": "test_evaluate.py",
     "record_demonstrations": "test_demonstrations.py",
     "record_faces": "test_recorded_faces.py",

@@ -23,8 +23,8 @@ def action(slide=(0.0, 0.0), press=0.4, lesions=()):
 
 def true_rows(task):
     """The true map as an action declares it."""
-    chart, radius = task.charted.chart, task.charted.tip_radius
-    return [(1.0, *chart.place(np.array(lesion.centre)), lesion.radius / radius - 1.0) for lesion in task.lesions]
+    assert task.true_map[:, 2].tolist() == [lesion.radius for lesion in task.lesions]
+    return [(1.0, across, along, radius / task.charted.tip_radius - 1.0) for across, along, radius in task.true_map]
 
 
 @pytest.fixture

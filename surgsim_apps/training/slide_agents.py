@@ -157,7 +157,7 @@ def spiral(touch_map: TouchMap, spacing: float) -> FloatArray:
         np.linalg.norm(away[np.abs((angle - at + math.pi) % (2 * math.pi) - math.pi) < 0.4], axis=1) for at in sectors
     ]
     border = np.array([lengths.max(initial=0.0) for lengths in reach])
-    turns = max(1, math.ceil(border.min() / spacing))
+    turns = max(1, math.ceil(border.max() / spacing))
     share = 1.0 - (np.arange(16 * turns) + 8.0) / (16 * turns + 8.0)
     directions = np.stack([np.cos(sectors), np.sin(sectors)], axis=1)
     return middle + np.tile(border[:, None] * directions, (turns, 1)) * share[:, None]
@@ -226,7 +226,9 @@ class SlideSweep:
         if self.memory.steps % MAP_STEPS == 0:
             self.declared = self.declare(self.memory)
         slide = np.clip(self.way.velocity(self.memory.place), -1.0, 1.0)
-        return np.concatenate([slide, [self.press], self.declared]).astype(np.float32)
+        # At the end of the way the tip lifts: a rest on the tissue doses it.
+        press = -1.0 if self.way.goal is None else self.press
+        return np.concatenate([slide, [press], self.declared]).astype(np.float32)
 
     def declare(self, memory: SlideMemory) -> FloatArray:
         """The declared map as numbers of an action."""
@@ -292,10 +294,9 @@ class SlideOracle(SlideSweep):
 
     def see(self, task: SlideTask) -> None:
         """Take the truth of the episode, after `reset`."""
-        chart, radius = task.charted.chart, task.charted.tip_radius
-        centres = np.array([lesion.centre for lesion in task.lesions]).reshape(-1, 3)
-        self.lesions = 0.5 * (chart.place(centres) + 1.0) * chart.extent / radius
-        self.radii = np.array([lesion.radius for lesion in task.lesions]) / radius
+        truth, radius = task.true_map, task.charted.tip_radius
+        self.lesions = 0.5 * (truth[:, :2] + 1.0) * task.charted.chart.extent / radius
+        self.radii = truth[:, 2] / radius
         self.touched: list[int] = []
 
     def places(self, memory: SlideMemory) -> FloatArray:

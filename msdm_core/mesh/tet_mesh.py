@@ -61,9 +61,9 @@ class TetMesh:
         tet_array[negative] = tet_array[negative][:, [0, 1, 3, 2]]
         _check_one_body(tet_array)
         pairs = region_names.items() if isinstance(region_names, dict) else region_names
-        object.__setattr__(self, "points", _frozen(point_array))
-        object.__setattr__(self, "tets", _frozen(tet_array))
-        object.__setattr__(self, "region", _frozen(_checked_region(region, len(tet_array))))
+        object.__setattr__(self, "points", read_only(point_array))
+        object.__setattr__(self, "tets", read_only(tet_array))
+        object.__setattr__(self, "region", read_only(_checked_region(region, len(tet_array))))
         object.__setattr__(self, "region_names", tuple((int(tag), str(name)) for tag, name in pairs))
 
     @property
@@ -91,7 +91,7 @@ class TetMesh:
         other = object.__new__(TetMesh)
         kept = {name: getattr(self, name) for name in ("tets", "region", "region_names", "_edge_table", "_boundary")}
         origin = self if self.origin is None else self.origin
-        vars(other).update(points=_frozen(array), origin=origin, **kept)
+        vars(other).update(points=read_only(array), origin=origin, **kept)
         return other
 
     def scaled(self, factor: float) -> "TetMesh":
@@ -119,7 +119,7 @@ class TetMesh:
     @cached_property
     def volumes(self) -> FloatArray:
         """Volume of each tet [m^3], shape (n_tet,)."""
-        return _frozen(tet_volumes(self.points, self.tets))
+        return read_only(tet_volumes(self.points, self.tets))
 
     @cached_property
     def edges(self) -> IntArray:
@@ -137,7 +137,7 @@ class TetMesh:
         keys = pairs[:, 0] * self.node_count + pairs[:, 1]
         unique, inverse = np.unique(keys, return_inverse=True)
         edges = np.column_stack([unique // self.node_count, unique % self.node_count])
-        return _frozen(edges.astype(np.int32)), _frozen(inverse.reshape(-1, 6).astype(np.int32))
+        return read_only(edges.astype(np.int32)), read_only(inverse.reshape(-1, 6).astype(np.int32))
 
     @cached_property
     def boundary_triangles(self) -> IntArray:
@@ -152,12 +152,12 @@ class TetMesh:
     @cached_property
     def _boundary(self) -> tuple[IntArray, IntArray]:
         faces, tets = outer_faces(self.tets)
-        return _frozen(faces), _frozen(tets)
+        return read_only(faces), read_only(tets)
 
     @cached_property
     def boundary_nodes(self) -> IntArray:
         """Sorted indices of the nodes on the outer surface, shape (n_boundary_node,)."""
-        return _frozen(np.unique(self.boundary_triangles).astype(np.int32))
+        return read_only(np.unique(self.boundary_triangles).astype(np.int32))
 
     def __repr__(self) -> str:
         size = np.ptp(self.points, axis=0) * 1000
@@ -231,9 +231,17 @@ def part_sizes(part: IntArray) -> str:
     return ", ".join(map(str, sizes[:6])) + (", ..." if len(sizes) > 6 else "")
 
 
-def _frozen(array: NDArray) -> NDArray:
+def read_only(array: NDArray) -> NDArray:
+    """The array, made read-only."""
     array.setflags(write=False)
     return array
+
+
+def protect_arrays(record: object) -> None:
+    """Make the arrays of a record read-only, as all users of the process share it."""
+    for value in vars(record).values():
+        if isinstance(value, np.ndarray):
+            read_only(value)
 
 
 def check_finite(points: FloatArray, noun: str) -> None:

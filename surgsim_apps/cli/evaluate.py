@@ -72,6 +72,8 @@ class Evaluate:
             raise ValueError(
                 "--env and --env-arguments are for --agent MODULE:CLASS; other methods have environments of their own"
             )
+        if options.submit and self.policy is None and ":" not in (self.agent or ""):
+            raise ValueError("--submit is for --policy and --agent MODULE:CLASS, whose files have a digest")
         if options.results is not None:
             with output_folder(options.results, option="--results"):
                 pass

@@ -4,6 +4,7 @@ An agent draws from `agent_generator(seed)`, separate from all environments. Onl
 `sees_truth = True` gets the task with the truth, by its method `see`.
 """
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -147,7 +148,7 @@ def episode_facts(env: Any, env_id: str, env_kwargs: dict[str, Any]) -> EpisodeF
     single = env.unwrapped
     return EpisodeFacts(
         env_id=env_id,
-        env_kwargs=dict(env_kwargs),
+        env_kwargs=copy.deepcopy(env_kwargs),
         observation_slices=single.observation_slices,
         action_size=single.action_space.shape[0],
         control_step=single.scene.timing.control_step,

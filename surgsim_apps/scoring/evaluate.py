@@ -6,6 +6,7 @@ scene and level. Other results are printed, and written into the folder of the o
 
 import datetime
 import importlib
+import itertools
 import math
 import shlex
 import sys
@@ -48,6 +49,7 @@ from surgsim_apps.scoring.results import (
     shipped_results,
 )
 from surgsim_apps.scoring.site_search import AGENTS, RASTER_SIDES, REFERENCES
+from surgsim_apps.scoring.submission import files_digest, module_digest, submission_seeds
 from surgsim_apps.training.site_agent import site_facts
 from surgsim_apps.training.slide_agents import SLIDES
 from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
@@ -76,6 +78,7 @@ class Player:
         sees_truth: True if it may see hidden truth.
         own_estimate: True if its own estimate is scored.
         ours: True if its result belongs in agents/results.
+        digest: of its files, if it is submitted.
     """
 
     name: str
@@ -86,6 +89,7 @@ class Player:
     sees_truth: bool = False
     own_estimate: bool = False
     ours: bool = True
+    digest: str = ""
 
 
 @dataclass(frozen=True)
@@ -250,7 +254,16 @@ def _strangers_player(name: str, options: ScoringOptions) -> Player:
     all_kwargs = kwargs if options.motion is None else {**kwargs, "motion": options.motion}
     actor = strangers_actor(name, "--agent", env_id, all_kwargs)
     declared = _declared(actor.make())
-    return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, ours=False)
+    digest = _agent_digest(name, actor.make) if options.submit else ""
+    return Player(name.replace(":", "."), actor, env_id, kwargs, ("--agent", name), *declared, False, digest)
+
+
+def _agent_digest(text: str, make: Any) -> str:
+    """Digest of the module of MODULE:CLASS; refuses a class that another module or package defines."""
+    module, owner = text.partition(":")[0], str(getattr(make, "__module__", None))
+    if module.partition(".")[0] != owner.partition(".")[0]:
+        raise ValueError(f"--agent {text}: the class is of the module {owner}, which must be named for --submit")
+    return module_digest(module)
 
 
 def _defaults(env_id: str) -> dict[str, str]:
@@ -297,8 +310,11 @@ def policy_player(path: Path, options: ScoringOptions) -> Player:
     own = {**(PLACES if env_id == SITES else {}), **policy.description.env_kwargs}
     kwargs = {**{name: value for name, value in own.items() if name != "split"}, **_places(options, own)}
     policy.reset(min(options.envs, len(options.played_seeds)))
-    ours = path.resolve().parent == policies_folder()
-    return Player(path.stem, policy, env_id, kwargs, ("--policy", _from_here(path)), ours=ours)
+    ours, digest = path.resolve().parent == policies_folder(), ""
+    if options.submit:
+        suffixes = (".json",) if policy.description.network is None else (".json", ".safetensors")
+        digest = files_digest({suffix: path.with_suffix(suffix) for suffix in suffixes})
+    return Player(path.stem, policy, env_id, kwargs, ("--policy", _from_here(path)), ours=ours, digest=digest)
 
 
 def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
@@ -328,11 +344,11 @@ def _arguments(player: Player, options: ScoringOptions) -> dict[str, Any]:
 
 def evaluate(player: Player, options: ScoringOptions, console: Console) -> Result:
     """Play the seeds of the options; print the result and write its file."""
-    kwargs, seeds, env_id, actor = _arguments(player, options), options.played_seeds, player.env_id, player.actor
+    kwargs, env_id, actor = _arguments(player, options), player.env_id, player.actor
     suffixes = ("untracked" * options.no_tracking, Path(options.instrument or "").stem)
     name = "_".join([player.name, *filter(None, suffixes)])
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    count = 1 if actor is None else min(options.envs, len(seeds))
+    count = 1 if actor is None else min(options.envs, len(options.played_seeds))
     try:
         envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
     except (gym.error.Error, TypeError, ValueError) as error:
@@ -340,6 +356,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     first = envs.unwrapped.envs[0].unwrapped  # type: ignore[attr-defined]
     if player.chosen_by[0] == "--policy":
         actor.check_environment(first, f"policy {name}")  # type: ignore[union-attr]
+    seeds = _seeds(player, options, first)
     start = time.perf_counter()
     with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
         if actor is not None and env_id == SITES:
@@ -364,6 +381,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         successes=succeeded,
         sees_truth=player.sees_truth,
         own_estimate=player.own_estimate,
+        agent_digest=player.digest,
         **scored,
     )
     path = _write(result, player, options)
@@ -374,8 +392,18 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     )
     figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
     where = "not written (--results FOLDER does)" if path is None else f"-> {path}"
-    _say(console, f"{result.place} {result.method}: {figures}; {result.wall_time:.0f} s {where}")
+    kind = f"submission {player.digest[:12]}" if player.digest else "public seeds"
+    _say(console, f"{result.place} {result.method}, {kind}: {figures}; {result.wall_time:.0f} s {where}")
     return result
+
+
+def _seeds(player: Player, options: ScoringOptions, env: Any) -> tuple[int, ...]:
+    """Seeds of the episodes: as many of a submission as the options have."""
+    if not options.submit:
+        return options.played_seeds
+    level = "" if env.task.level is None else env.task.level.name
+    stream = submission_seeds(player.digest, player.env_id, env.scene.name, level)
+    return tuple(itertools.islice(stream, len(options.played_seeds)))
 
 
 def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:

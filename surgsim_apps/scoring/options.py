@@ -28,6 +28,8 @@ class ScoringOptions:
     """Presses and oracles go where the surface is at rest, as it moves."""
     seeds: str | None = None
     """FIRST:LAST or A,B,C; default: the evaluation seeds."""
+    submit: bool = False
+    """Play seeds that follow from the digest of the agent's or policy's files (docs/own_agent.md)."""
     episodes: int | None = None
     """Number of episodes: the first of the seeds."""
     budget: int | None = None
@@ -49,6 +51,8 @@ class ScoringOptions:
         for name in ("envs", "threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        if self.submit and self.seeds is not None:
+            raise ValueError(f"--seeds is {self.seeds!r}, and those of --submit follow from the agent: leave one out")
         seeds = self._seeds
         if self.episodes is not None and not 1 <= self.episodes <= len(seeds):
             raise ValueError(f"--episodes is {self.episodes}; there are 1 to {len(seeds)} seeds")
@@ -57,7 +61,7 @@ class ScoringOptions:
 
     @cached_property
     def played_seeds(self) -> tuple[int, ...]:
-        """Seeds of the episodes."""
+        """Seeds of the episodes; of a submission only their number counts."""
         return self._seeds[: self.episodes]
 
     @property
@@ -68,7 +72,7 @@ class ScoringOptions:
     def standard(self) -> bool:
         """True for results as shipped: of all evaluation seeds, with the default presses and lanes."""
         all_seeds = self.played_seeds == tuple(EVALUATION_SEEDS)
-        return all_seeds and self.budget is None and self.dtype == type(self).dtype
+        return all_seeds and not self.submit and self.budget is None and self.dtype == type(self).dtype
 
     @cached_property
     def env_kwargs(self) -> dict[str, Any]:

@@ -37,6 +37,7 @@ class Result:
         lesion_counts: lesions of each episode (PalpateSites only)
         sees_truth: True if the method declares that it sees hidden truth
         own_estimate: True if its own estimate is scored instead of the common estimator's
+        agent_digest: SHA-256 of a submission's files, of which its seeds follow; "" for other seeds
     """
 
     method: str
@@ -54,6 +55,7 @@ class Result:
     successes: list[bool] = field(default_factory=list)
     sees_truth: bool = False
     own_estimate: bool = False
+    agent_digest: str = ""
 
     @property
     def place(self) -> str:
@@ -75,8 +77,8 @@ class Result:
         return "" if motion == STILL else motion
 
     def save(self, folder: Path) -> Path:
-        """Write it into a folder; replaces an older result of the same method and place."""
-        name = f"{self.place}_{self.method}.json"
+        """Write it into a folder; replaces an older result of the same method and place, a submission an older one."""
+        name = f"{self.place}_{self.method}{'_submission' * bool(self.agent_digest)}.json"
         table = asdict(self)
         table["seeds"] = seeds_text(self.seeds)
         table["figures"] = {key: [_written(value) for value in astuple(figure)] for key, figure in self.figures.items()}

@@ -1,5 +1,6 @@
 """Agents for SurgSim/PalpateSites-v0: their interface, the facts of an episode, and their belief after presses."""
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -104,11 +105,11 @@ class SiteAgent(Protocol):
 
 
 def site_facts(env: Any) -> SiteFacts:
-    """Facts of an environment, without its wrappers."""
+    """Facts of an environment, without its wrappers; the map is a copy, as all environments share theirs."""
     task = env.unwrapped.task
     charted, estimator = task.charted, task.estimator
     return SiteFacts(
-        charted.touch_map,
+        copy.deepcopy(charted.touch_map),
         charted.tip_radius,
         estimator.lesion_radius,
         estimator.noise,

@@ -172,6 +172,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             )
         self._take(values)
         info = self._info("", saturated, self.runtime.first_info(), dict.fromkeys(reward_weights(self.task), 0.0))
+        # Stiff lesions need added mass, which would tell of them.
+        info["added_mass"] = 0.0
         self.halted = ""
         self._show()
         return self._observed(), info

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.arithmetic import matmul, norm
-from msdm_core.mesh.tet_mesh import FloatArray
+from msdm_core.mesh.tet_mesh import FloatArray, protect_arrays, read_only
 from msdm_core.mesh_files.mesh_file import checked_content
 from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.coupling.simulation import Simulation
@@ -62,6 +62,9 @@ class Chart:
     lower: FloatArray
     upper: FloatArray
     side_count: int
+
+    def __post_init__(self) -> None:
+        protect_arrays(self)
 
     @property
     def extent(self) -> FloatArray:
@@ -128,6 +131,9 @@ class TouchMap:
     cell: float
     pressable: NDArray[np.bool_]
 
+    def __post_init__(self) -> None:
+        protect_arrays(self)
+
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates of columns and rows, lengths along the chart's sides [m], (MAP_SIDE,) each.
@@ -141,23 +147,23 @@ class TouchMap:
     @cached_property
     def sites(self) -> FloatArray:
         """Lengths of all sites along the chart's sides [m], row by row, shape (MAP_SIDE**2, 2)."""
-        return np.stack(np.meshgrid(*self.axes), axis=-1).reshape(-1, 2)
+        return read_only(np.stack(np.meshgrid(*self.axes), axis=-1).reshape(-1, 2))
 
     @cached_property
     def places(self) -> FloatArray:
         """Places of all sites on the chart (MAP_SIDE**2, 2), -1 to 1 inside it."""
-        return 2.0 * self.sites / self.extent - 1.0
+        return read_only(2.0 * self.sites / self.extent - 1.0)
 
     @cached_property
     def numbers(self) -> NDArray[np.intp]:
         """Column and row of each site (MAP_SIDE**2, 2)."""
-        return np.stack(np.divmod(np.arange(MAP_SIDE * MAP_SIDE), MAP_SIDE)[::-1], axis=-1)
+        return read_only(np.stack(np.divmod(np.arange(MAP_SIDE * MAP_SIDE), MAP_SIDE)[::-1], axis=-1))
 
     @cached_property
     def rows_and_columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Numbers of the rows and of the columns with a pressable site, ascending."""
         face = self.pressable.reshape(MAP_SIDE, MAP_SIDE)
-        return np.flatnonzero(face.any(axis=1)), np.flatnonzero(face.any(axis=0))
+        return read_only(np.flatnonzero(face.any(axis=1))), read_only(np.flatnonzero(face.any(axis=0)))
 
     def nearest(self, places: ArrayLike) -> NDArray[np.intp]:
         """Number of the site nearest to each place (..., 2) of the chart; -1 beyond the square."""
@@ -244,7 +250,7 @@ class ChartedFace:
                 "no site of the palpable face may be pressed: lower palpation.face_margin or thickness_smallest, or "
                 "move the anchors"
             )
-        places, points, normals = (np.array(values) for values in zip(*allowed, strict=True))
+        places, points, normals = (read_only(np.array(values)) for values in zip(*allowed, strict=True))
         return places, points, normals
 
     @cached_property
@@ -277,7 +283,7 @@ class ChartedFace:
         known = np.array([index for index, point in enumerate(dropped) if point is not None])
         points = np.array([dropped[index][0] for index in known])  # type: ignore[index]
         nearest = [int(np.argmin(np.square(places[known] - place).sum(axis=1))) for place in places]
-        return points[nearest].reshape(side, side, 3)
+        return read_only(points[nearest].reshape(side, side, 3))
 
 
 def interpolated(values: FloatArray, places: ArrayLike) -> FloatArray:
@@ -306,6 +312,9 @@ class HealthyMap:
     """
 
     grid: FloatArray
+
+    def __post_init__(self) -> None:
+        protect_arrays(self)
 
     def stiffness(self, places: ArrayLike) -> FloatArray:
         """At places of the chart (..., 2) [N/m], shape (...)."""

@@ -13,7 +13,7 @@ from msdm_core.kernels.ray_kernels import nearest_hits
 from msdm_core.material.regions import Material
 from msdm_core.mesh.geodesic import NearestTriangle
 from msdm_core.mesh.surface import node_normals
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, protect_arrays
 from surgsim_env.scene.model import PalpationSettings
 
 # Rounding error of heights of the face [m].
@@ -56,6 +56,9 @@ class PalpableFace:
     thickness_smallest: float
     solid: FloatArray
     tip_radius: float
+
+    def __post_init__(self) -> None:
+        protect_arrays(self)
 
     def project(self, point: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Point of the face nearest to a point [m] and the unit outward normal there, each (3,)."""

@@ -126,7 +126,7 @@ class PalpateTask(Task):
     arm's joint and speed limits), `hard_limit`, `declared`, `success`, `is_success` (bool), `force_peak` [N], `cost`
     (force above the soft limit, 1 at the hard one: a constraint for safe learning), `error_mm` (-1 if nothing was
     declared), `trocar_error_mm` (distance of the shaft's axis from the trocar; -1 for the probe, which passes
-    through none), `added_mass` [kg] (by mass scaling, 0 without), one `reward_<term>` each.
+    through none), `added_mass` [kg] (by mass scaling, 0 without and after a reset), one `reward_<term>` each.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure`, `strain` or `dose`, and with `measure_tissue`, also `tissue_pressure` [Pa]
     and `tissue_strain`, the largest of the tissue at the end of the step, `tissue_extrapolated` (bool): strain beyond

@@ -100,9 +100,10 @@ class PalpateSitesTask(Task):
     `stopped_by_force`, `contrast_cut` (bool), `force`, `force_peak` [N], `depth` [m], `stiffness` [N/m], `contrast`,
     `moved_mm`, `cost` (force over the soft limit, 1 at the hard one: a constraint for safe learning),
     `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. Of the episode so far: `seconds`, `path_length` [m],
-    `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm), `found`
-    (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none),
-    `lesion_count_estimated`, `success`, `is_success`.
+    `error_mm` (OSPA between estimated and true places, Schuhmacher et al. 2008, cutoff 20 mm; -1 after a reset),
+    `found` (share of lesions with an estimate within 10 mm; on an organ without lesions 1 if the estimate has none; 0
+    after a reset), `lesion_count_estimated`, `success`, `is_success`. The info of a reset does not depend on the
+    lesions; `error_mm`, `found` and the rewards of a step are the truth, for training and scores alone.
     Where the scene is a family of organs also `member` (str), the one that the episode plays, such as "train 7".
     Where the scene has `[limits] pressure`, `strain` or `dose`, and with `measure_tissue`, also `tissue_pressure` [Pa]
     and `tissue_strain`, the largest of the tissue at the end of the press, `tissue_extrapolated` (bool): strain beyond
@@ -405,8 +406,9 @@ class PalpateSitesTask(Task):
             "moved_mm": last.moved * 1000.0,
             "seconds": self.felt.seconds,
             "path_length": self.felt.path_length,
-            "error_mm": self.error * 1000.0,
-            "found": self.found,
+            # Before the first press they would tell whether there are lesions.
+            "error_mm": -1.0 if step is None else self.error * 1000.0,
+            "found": 0.0 if step is None else self.found,
             "lesion_count_estimated": float(len(self.estimated)),
         }
 

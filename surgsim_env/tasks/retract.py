@@ -135,7 +135,8 @@ class RetractTask(Task):
     ## Description
     A lobe of soft tissue, held along one edge, lies on its bed and hides a disc. A robot's jaw grasps it near its free
     edge, with friction alone, and lifts or folds it until the endoscope sees at least 80 % of the disc for half a
-    second. Tissue and jaw exchange forces 1000 times a second; the agent acts 20 times a second.
+    second while the jaw holds tissue. Tissue and jaw exchange forces 1000 times a second; the agent acts 20 times a
+    second.
 
     ## Action Space
     `Box(-1, 1, (4 + n,), float32)`; n numbers turn the wrist: 0 for an instrument that does not turn, 1 or 3.
@@ -155,9 +156,10 @@ class RetractTask(Task):
     settled on its bed, the jaw is open, and at most 10 % of the target is visible: other draws are repeated.
 
     ## Episode End
-    Terminated: 80 % of the target was visible for 0.5 s (success); in a haptic step the contact force exceeded the hard
-    limit, or the jaw's pull exceeded the strength of the tissue; the simulation faulted (`info["sim_fault"]` says how,
-    the observation is the last finite one). Truncated: 600 control steps (30 s).
+    Terminated: 80 % of the target was visible for 0.5 s with tissue held between the pads (success; a shut jaw that
+    scoops the lobe up does not succeed); in a haptic step the contact force exceeded the hard limit, or the jaw's pull
+    exceeded the strength of the tissue; the simulation faulted (`info["sim_fault"]` says how, the observation is the
+    last finite one). Truncated: 600 control steps (30 s).
 
     ## Info
     Fixed keys and types. Of the step: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited`,
@@ -270,7 +272,7 @@ class RetractTask(Task):
         ),
         Reward("visible", 4.0, "change", "share of the target that is visible", lambda task, step: task.visible_share),
         Reward("grasped", 1.0, "change", "1 while tissue is between the pads", lambda task, step: task.grasp.holds),
-        Reward("success", 10.0, "success", "visible for long enough"),
+        Reward("success", 10.0, "success", "visible for long enough, in a grasp"),
         Reward("torn", -12.0, "failure", "the jaw pulled harder than the tissue bears"),
         Reward("hard_force", -12.0, "failure", "the force exceeded the hard limit: a safety stop"),
         Reward("fault", -12.0, "failure", "the simulation could not go on"),
@@ -394,8 +396,9 @@ class RetractTask(Task):
         return "hard_force" if step.force_peak > self.limits.hard_force else ""
 
     def at_goal(self, simulation: Simulation) -> bool:
-        """True in a state of success, to be held for SUCCESS_TIME."""
-        return self.visible_share >= SUCCESS_SHARE
+        """True if the jaw holds tissue and the target is visible, a state to be kept for SUCCESS_TIME."""
+        assert self.grasp is not None
+        return self.grasp.holds and self.visible_share >= SUCCESS_SHARE
 
     def info(self, step: ControlStep | None, end: str) -> dict[str, InfoValue]:
         """Forces, the grasp, the visible share and the record; without a grasp after a reset or a fault."""

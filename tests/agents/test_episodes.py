@@ -1,7 +1,10 @@
 """Episodes played for scores: agents' random numbers, lanes without a seed, and who sees the truth."""
 
+import contextlib
+import copy
+import itertools
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -19,8 +22,9 @@ from surgsim_apps.scoring.episodes import (
     play_tasks,
     site_success,
 )
-from surgsim_apps.scoring.figures import MapScore, press_errors
+from surgsim_apps.scoring.figures import EVALUATION_SEEDS, MapScore, press_errors
 from surgsim_apps.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
+from surgsim_apps.scoring.submission import SEED_LEAST, submission_seeds
 from surgsim_env.rendering import gl
 from surgsim_env.tasks.palpate import EPISODE_STEPS
 
@@ -98,6 +102,100 @@ def test_lanes_without_a_seed_are_not_stepped(monkeypatch: pytest.MonkeyPatch):
 def test_more_lanes_than_seeds():
     (record,) = play_sites(AgentActor(RandomSites), make_envs(SITES, 3, **SMALL), [5])
     assert len(record.force) == 2
+
+
+# ---- cheating --------------------------------------------------------------------------------------------------------
+
+
+def overwrite(value: Any) -> int:
+    """Write into all arrays and dictionaries that a value reaches, by force; the number of arrays."""
+    if isinstance(value, np.ndarray):
+        for array in (value, value.base):
+            if isinstance(array, np.ndarray):
+                with contextlib.suppress(ValueError):
+                    array.setflags(write=True)
+                    array[...] = 0
+        return 1
+    count = 0
+    if isinstance(value, dict):
+        count = sum(map(overwrite, list(value.values())))
+        value.clear()
+    elif isinstance(value, (tuple, list)):
+        count = sum(map(overwrite, value))
+    elif is_dataclass(value):
+        names = [name for name in dir(value) if not name.startswith("_")]
+        parts = [part for name in names if not callable(part := getattr(value, name))]
+        count = sum(map(overwrite, parts))
+        for name in vars(value):
+            object.__setattr__(value, name, None)
+    return count
+
+
+class Vandal(RandomSites):
+    """Writes into everything that it is given."""
+
+    def reset(self, rng: np.random.Generator, facts: Any) -> None:
+        super().reset(rng, copy.deepcopy(facts))
+        with np.errstate(all="ignore"):  # lengths of 0
+            assert overwrite(facts) >= 8
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        action = super().act(observation)
+        assert overwrite(observation) == 1
+        return action
+
+
+def test_an_agent_that_writes_into_what_it_is_given_changes_no_episode():
+    """Nor one of another environment of the process, whose chart is the same."""
+    seeds = [5, 6, 7]
+    records = play_sites(AgentActor(Vandal), make_envs(SITES, 1, dtype="float64", **SMALL), seeds)
+    after = play_sites(AgentActor(RandomSites), make_envs(SITES, 1, dtype="float64", **SMALL), seeds)
+    for record, expected in zip(records, after, strict=True):
+        np.testing.assert_array_equal(record.force, expected.force)
+        np.testing.assert_array_equal(record.estimates[-1], expected.estimates[-1])
+    env: Any = gym.make(SITES, **SMALL).unwrapped
+    observation, _ = env.reset(seed=5)
+    assert observation[env.observation_slices["face_map"]].sum() > 100 and env.task.felt.healthy.grid.all()
+
+
+@pytest.mark.parametrize(("env_id", "kwargs"), [(SITES, SMALL), ("SurgSim/Palpate-v0", {"scene": "phantom_small"})])
+def test_facts_infos_and_observations_are_copies(env_id: str, kwargs: dict[str, Any]):
+    kwargs, made = kwargs | {"nested": {"list": [1]}}, dict(kwargs)
+    given = copy.deepcopy(kwargs)
+    spoiled, other = (gym.make(env_id, **made) for _ in range(2))
+    facts = episode_facts(spoiled, env_id, kwargs)
+    overwrite(facts.env_kwargs["nested"])
+    overwrite(facts)
+    assert kwargs == given
+    for seen in zip(spoiled.reset(seed=5), other.reset(seed=5), strict=True):
+        overwrite(seen[0])
+    action = np.zeros(spoiled.action_space.shape or (), dtype=np.float32)
+    for _ in range(2):
+        parts, expected = spoiled.step(action), other.step(action)
+        np.testing.assert_array_equal(parts[0], expected[0])
+        assert parts[1:] == expected[1:] and parts[4]
+        overwrite(parts[0]), overwrite(parts[4])
+    assert spoiled.unwrapped.observation_slices == other.unwrapped.observation_slices  # type: ignore[attr-defined]
+
+
+def test_a_table_of_public_seeds_does_not_know_those_of_a_submission():
+    """An agent that recognises its episode by the first observation finds all public ones and no other."""
+    env = gym.make("SurgSim/Palpate-v0", scene="phantom_small")
+
+    def first(seed: int) -> bytes:
+        return env.reset(seed=seed)[0].tobytes()
+
+    def submitted(digest: str) -> list[int]:
+        return list(itertools.islice(submission_seeds(digest, "SurgSim/Palpate-v0", "phantom_small", ""), 100))
+
+    table = {first(seed) for seed in EVALUATION_SEEDS[:3]}
+    assert all(first(seed) in table for seed in EVALUATION_SEEDS[:3])
+    seeds, others = submitted("a"), submitted("b")
+    assert not any(first(seed) in table for seed in seeds[:3])
+    assert seeds == submitted("a") and len({*seeds, *others, *EVALUATION_SEEDS}) == 300
+    assert all(SEED_LEAST <= seed < 2 * SEED_LEAST for seed in seeds)
+    for place in (("SurgSim/Palpate-v0", "phantom", ""), ("SurgSim/Palpate-v0", "phantom_small", "hard")):
+        assert next(submission_seeds("a", *place)) not in seeds
 
 
 # ---- the truth -------------------------------------------------------------------------------------------------------

@@ -1,5 +1,8 @@
 """surgsim evaluate, end to end on few presses: result files, leaderboard, films."""
 
+import hashlib
+import importlib
+import itertools
 import json
 import math
 import re
@@ -27,6 +30,7 @@ from surgsim_apps.scoring.results import (
     seeds_text,
     shipped_results,
 )
+from surgsim_apps.scoring.submission import module_digest, submission_seeds
 from surgsim_env.scene.digest import PHYSICS_VERSION
 from surgsim_env.scene.load import scenes_folder
 from tests.agents.commands import surgsim
@@ -171,6 +175,8 @@ def test_wrong_options_are_refused() -> None:
         (["--agent", "gp_ucb", "--seeds", "9:5"], "seeds are '9:5'"),
         (["--agent", "gp_ucb", "--seeds", "1,x"], "seeds are '1,x'"),
         (["--agent", "gp_ucb", "--envs", "0"], "--envs is 0"),
+        (["--agent", "gp_ucb", "--submit"], "--submit is for --policy and --agent MODULE:CLASS"),
+        (["--agent", "my:Own", "--submit", "--seeds", "5"], "--seeds is '5'"),
         (
             ["--agent", "gp_ucb", "--env", "SurgSim/Palpate-v0"],
             "--env and --env-arguments are for --agent MODULE:CLASS",
@@ -306,6 +312,42 @@ def test_a_strangers_result_is_submitted(module: Path) -> None:
     Path("broken.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ValueError, match=r"broken.json is no result of surgsim evaluate"):
         surgsim("evaluate", "--compare", str(file), "broken.json")
+
+
+def test_seeds_of_a_submission_follow_from_its_file(module: Path) -> None:
+    name = ["--agent", "strangers_agent:Middle", "--scene", "phantom_small", "--episodes", "2", "--budget", "1"]
+
+    def submitted() -> Result:
+        surgsim("evaluate", *name, "--submit", "--results", "mine")
+        return load_result(Path("mine/PalpateSites_phantom_small_standard_strangers_agent.Middle_submission.json"))
+
+    first = submitted()
+    assert first.agent_digest == hashlib.sha256(module.read_bytes()).hexdigest() and "--submit" in first.command
+    stream = submission_seeds(first.agent_digest, SITES, "phantom_small", "standard")
+    assert list(first.seeds) == list(itertools.islice(stream, 2)) and submitted().seeds == first.seeds
+    module.write_text(AGENT + "# Another.\n", encoding="utf-8")
+    assert not {*submitted().seeds} & {*first.seeds}
+    surgsim("evaluate", *name, "--results", "mine")
+    assert len(list(Path("mine").iterdir())) == 2
+    # A class of another file, which the digest of this one would not cover.
+    module.write_text("from surgsim_apps.scoring.site_search import RandomSites", encoding="utf-8")
+    sys.modules.pop("strangers_agent")
+    with pytest.raises(ValueError, match=r"module surgsim_apps\.scoring\.site_search"):
+        surgsim("evaluate", "--agent", "strangers_agent:RandomSites", "--submit")
+
+
+def test_the_digest_of_a_package_is_of_all_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights among them, by name and content, as `sha256sum` lists them."""
+    files = {"__init__.py": b"", "weights/a.bin": b"\x00"}
+    for name, content in files.items():
+        path = tmp_path / "strangers_package" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("strangers_package")
+    lines = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items())
+    assert module_digest("strangers_package") == hashlib.sha256(lines.encode()).hexdigest()
+    sys.modules.pop("strangers_package")
 
 
 def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -39,6 +39,6 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
             commands += 1
     sys.modules.pop("my_agent", None)
     printed = capsys.readouterr().out
-    assert commands == 5
+    assert commands == 6
     assert "presses to 5 mm: my_agent.Spread " in printed
     assert load_result(Path("scores/Palpate_phantom_small_my_agent.Descend.json")).env_id == "SurgSim/Palpate-v0"

@@ -90,15 +90,35 @@ def test_seen_and_grasped_pay_once_however_often_they_come_and_go(episode):
 
 
 def test_success_is_a_half_second_on_end(episode):
+    """Of sight and hold at the same time: a shut jaw that scoops the lobe up holds nothing."""
     for _ in range(9):
-        assert not episode.step(visible=SUCCESS_SHARE).terminated
-    assert not episode.step(visible=SUCCESS_SHARE - 1e-6).terminated
+        assert not episode.step(visible=SUCCESS_SHARE, holds=True).terminated
+    assert not episode.step(visible=SUCCESS_SHARE - 1e-6, holds=True).terminated
     for _ in range(9):
-        assert not episode.step(visible=1.0).terminated
-    verdict = episode.step(visible=1.0)
+        assert not episode.step(visible=1.0, holds=True).terminated
+    for _ in range(20):
+        assert not episode.step(visible=1.0, holds=False).terminated
+    for _ in range(9):
+        assert not episode.step(visible=1.0, holds=True).terminated
+    verdict = episode.step(visible=1.0, holds=True)
     assert verdict.terminated and verdict.info["success"] and verdict.rewards["success"] == 10.0
     assert verdict.rewards["forgone"] == 0.0
     assert (SUCCESS_SHARE, HIDDEN_SHARE) == (0.8, 0.1)
+
+
+@pytest.mark.slow
+def test_a_shut_jaw_that_scoops_the_lobe_up_does_not_succeed(shared_retract):
+    """Under the free edge and up: the target is in sight, and nothing is held."""
+    shared_retract.reset(seed=3)
+    x, seen = shared_retract.task.drawn.target[0], 0
+    for y, z, steps in ((0.072, -0.006, 20), (0.048, -0.004, 25), (0.046, 0.031, 36), (0.046, 0.031, 15)):
+        for _ in range(steps):
+            way = np.array([x, y, z]) - shared_retract.simulation.instrument.tip_position
+            velocity = way / max(np.abs(way).max() / SPEED_FULL_SCALE, STEP)
+            _, _, terminated, _, info = act(shared_retract, velocity, jaw=-1.0)
+            assert not terminated
+            seen += info["visible"] >= SUCCESS_SHARE
+    assert seen > 10 and not info["holds"]
 
 
 def test_soft_force_costs_by_its_share_of_the_way_to_the_hard_limit(episode):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.chart import MAP_SIDE, ChartedFace, charted_face, make_chart
+from surgsim_env.palpation.chart import MAP_SIDE, ChartedFace, HealthyMap, charted_face, make_chart
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene
 
@@ -19,6 +19,17 @@ def test_the_phantoms_chart_is_its_top_less_the_margin():
     assert make_chart(anatomy.face, 0.004).side_count == 21
     assert make_chart(anatomy.face, 0.001).side_count == 25
     np.testing.assert_allclose(chart.place([0.030, 0.050, 0.2]), [0.0, 1.0], atol=1e-12)
+
+
+def test_a_chart_shared_by_a_process_cannot_be_written():
+    """A site taken from its tables neither."""
+    charted = charted_face(load_anatomy(make_scene("phantom_small")))
+    touch_map, site = charted.touch_map, charted.site(np.array([5.0, 5.0]))
+    assert site.moved > 0.0
+    cached = (touch_map.sites, touch_map.places, touch_map.numbers, *touch_map.rows_and_columns, charted._surface)
+    records = (charted.face, charted.chart, touch_map, site, HealthyMap(np.ones((2, 2, 3))))
+    arrays = [part for record in records for part in vars(record).values() if isinstance(part, np.ndarray)]
+    assert len(arrays) >= 16 and not any(array.flags.writeable for array in (*arrays, *cached))
 
 
 @pytest.mark.parametrize("scene", ["phantom", "liver"])

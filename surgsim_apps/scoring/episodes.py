@@ -1,11 +1,11 @@
-"""Episodes of given seeds, played in vectorised environments and recorded, and the figures of a policy.
+"""Episodes of given seeds, played in vectorised environments and recorded, and the numbers of each.
 
 An agent draws from `agent_generator(seed)`, separate from all environments. Only an agent of a class that declares
 `sees_truth = True` gets the task with the truth, by its method `see`.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_apps.scoring.figures import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
+from surgsim_apps.scoring.figures import MapScore, PalpationRecord, press_errors
 from surgsim_apps.training.site_agent import site_facts
 from surgsim_env.palpation import HOLD_TIME, PRESS_SPEED
 from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
@@ -50,6 +50,28 @@ def make_envs(
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "dtype": dtype}
     kwargs["measure_tissue"] = True
     return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
+
+
+def equal_members(stream: Iterable[int], count: int, size: int) -> tuple[int, ...]:
+    """The first `count` seeds of a stream with a family's members in numbers that differ by at most 1.
+
+    Args:
+        stream: of seeds, without end.
+        count: of episodes.
+        size: members of the family; an environment draws one by the first number of `default_rng(seed)`.
+    """
+    whole, extra = divmod(count, size)
+    counts, seeds = [0] * size, []
+    for seed in stream:
+        if len(seeds) == count:
+            break
+        member = int(np.random.default_rng(seed).integers(size))
+        surplus = counts[member] == whole
+        if counts[member] < whole or (surplus and extra > 0):
+            extra -= surplus
+            counts[member] += 1
+            seeds.append(seed)
+    return tuple(seeds)
 
 
 def agent_generator(seed: int) -> np.random.Generator:
@@ -279,16 +301,15 @@ def play_scripts(
     return records
 
 
-def task_figures(
-    records: Sequence[TaskRecord], control_step: float, soft_force: float, rng: np.random.Generator
-) -> dict[str, ScoreEstimate]:
-    """The figures of a policy, with bootstrap intervals over episodes.
+def task_columns(
+    records: Sequence[TaskRecord], control_step: float, soft_force: float
+) -> dict[str, NDArray[np.float64]]:
+    """One number per episode (n,) of each figure of a policy, NaN if undefined.
 
     Args:
         records: at least one.
         control_step: duration of a step [s].
         soft_force: [N]; limit of the force in a gentle episode.
-        rng: for the bootstrap.
     """
     succeeded = [bool(record.last["success"]) for record in records]
     loads = np.array([np.max(record.loads, axis=0) for record in records])
@@ -312,7 +333,7 @@ def task_figures(
     if "error_mm" in records[0].last:
         errors = [float(record.last["error_mm"]) for record in records]
         columns["error_mm"] = [error if error >= 0.0 else math.nan for error in errors]
-    return with_intervals({name: np.array(values, dtype=np.float64) for name, values in columns.items()}, rng)
+    return {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
 
 
 # ---- SurgSim/PalpateSites-v0 ----------------------------------------------------------------------------------------
@@ -384,6 +405,7 @@ class SiteRecord:
             hard_limit=bool(info["hard_limit"]),
             fault=str(info["sim_fault"]),
             map=score if self.reference is None else self._own_map(score),
+            member=str(info.get("member", "")),
         )
 
     def _own_places(self) -> NDArray[np.float64]:

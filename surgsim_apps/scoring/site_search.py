@@ -4,21 +4,28 @@ Searches use observations and the size of the chart only (`SiteFacts`). Methods 
 `sees_truth`. The belief of the searches `gp_*` is a Gaussian process on log contrast.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
+from scipy.stats import norm, qmc
 
+from msdm_core.arithmetic import cos, matmul, sin
 from surgsim_apps.scoring.figures import MapScore
-from surgsim_apps.training.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
+from surgsim_apps.training.site_agent import SiteAgent, SiteFacts, SiteProcess
+from surgsim_env.palpation import BACKGROUND_SPREAD, EXCESS_SPREAD
 from surgsim_env.tasks import PalpateSitesTask
 
 # Parameters of GP-UCB and of the level-set search, chosen on organs outside all evaluations (docs/palpation.md).
 UCB_BETA = 3.0
 LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
+# Above so many candidates `GpEvr` takes every second one: its time grows with their square.
+EVR_SITES_MOST = 400
+# Waves in a sample of the prior by `GpThompson`.
+WAVE_COUNT = 256
 # The points of the face [m] (k, 3) at places of the chart (k, 2), each in [-1, 1].
 Surface = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -96,11 +103,29 @@ class GpVariance:
         self.count += 1
         if first is not None:
             return first
-        return self.process.best(self.worth(self.process.belief(observation)), observation, self.rng)
+        return self.process.best(self.worth(observation), observation, self.rng)
 
-    def worth(self, belief: Belief) -> NDArray[np.float64]:
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
         """The acquisition function at each site (n n,)."""
-        return belief.spread
+        return self.process.belief(observation).spread
+
+
+class GpEvr(GpVariance):
+    """Expected variance reduction (Cohn 1996; Seo et al. 2000): the press that leaves the least variance on the chart.
+
+    Like the deviation it does not depend on the measured contrast.
+    """
+
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The decrease of the variance, summed over the candidates; 0 elsewhere."""
+        sites = np.flatnonzero(self.process.candidates)
+        if len(sites) > EVR_SITES_MOST:
+            # A checkerboard: rows have an odd number of sites.
+            sites = sites[sites % 2 == 0]
+        pressed, points = self.process.touches(observation)[0], self.process.facts.sites
+        worth = np.zeros(len(points))
+        worth[sites] = self.process.process.variance_reduction(points[pressed], points[sites])
+        return worth
 
 
 class GpUcb(GpVariance):
@@ -108,9 +133,49 @@ class GpUcb(GpVariance):
 
     begins_with_raster = True
 
-    def worth(self, belief: Belief) -> NDArray[np.float64]:
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
         """The upper confidence bound."""
+        belief = self.process.belief(observation)
         return belief.excess + UCB_BETA * belief.spread
+
+
+class GpEi(GpVariance):
+    """Expected improvement (Jones et al. 1998) over the largest expected excess."""
+
+    begins_with_raster = True
+
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The improvement's expectation d P(z) + s p(z), z = d / s, by the normal distribution P and its density p."""
+        belief = self.process.belief(observation)
+        gain = belief.excess - belief.excess[self.process.candidates].max()
+        ratio = gain / np.maximum(belief.spread, 1e-9)
+        return gain * norm.cdf(ratio) + belief.spread * norm.pdf(ratio)
+
+
+class GpThompson(GpVariance):
+    """Posterior sampling (Thompson 1933; Kandasamy et al. 2018): the maximum of one sample of the excess.
+
+    The sample is a sum of random waves of the prior (Rahimi & Recht 2007), corrected by the process of the difference
+    between what was felt and the same presses on the sample (Wilson et al. 2020, "Efficiently sampling functions from
+    Gaussian process posteriors").
+    """
+
+    begins_with_raster = True
+
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The sample."""
+        process, facts, rng = self.process.process, self.process.facts, self.rng
+        pressed, values, gradients = self.process.touches(observation)
+        waves, phases = rng.normal(size=(2, WAVE_COUNT)) / process.length, rng.uniform(0.0, 2.0 * math.pi, WAVE_COUNT)
+        scale, pressable = EXCESS_SPREAD * math.sqrt(2.0 / WAVE_COUNT), facts.map.pressable
+        sample = np.zeros(len(facts.sites))
+        sample[pressable] = scale * cos(matmul(facts.sites[pressable], waves) + phases).sum(axis=1)
+        noise = rng.normal(scale=math.sqrt(process.noise_variance), size=len(pressed))
+        felt = sample[pressed] + rng.normal(scale=BACKGROUND_SPREAD) + noise
+        if gradients is not None:
+            slopes = -scale * matmul(sin(matmul(facts.sites[pressed], waves) + phases), waves.T)
+            gradients = gradients - rng.normal(slopes, math.sqrt(process.gradient_variance))
+        return sample + process.mean(facts.sites[pressed], values - felt, gradients)[1].ravel()
 
 
 class GpLevelSet(GpVariance):
@@ -124,8 +189,9 @@ class GpLevelSet(GpVariance):
 
     begins_with_raster = True
 
-    def worth(self, belief: Belief) -> NDArray[np.float64]:
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
         """The ambiguity; the level is at least the estimator's least excess of a lesion."""
+        belief = self.process.belief(observation)
         excess, margin = belief.excess, LEVEL_BETA * belief.spread
         level = max(self.process.facts.excess_least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
         return np.minimum(excess + margin - level, level - excess + margin)
@@ -228,8 +294,10 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "random": RandomSites,
     **{f"raster_{side}": lambda side=side: RasterSites(side) for side in RASTER_SIDES},
     "sobol": SobolSites,
-    "gp_variance": GpVariance,
+    "gp_evr": GpEvr,
     "gp_ucb": GpUcb,
+    "gp_ei": GpEi,
+    "gp_thompson": GpThompson,
     "gp_level_set": GpLevelSet,
     "oracle": OracleSites,
     "oracle_near": OracleNear,

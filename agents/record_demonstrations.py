@@ -191,7 +191,8 @@ def record(
     """
     reserved = next((seed for seed in seeds if seed >= EVALUATION_SEEDS.start), None)
     if reserved is not None:
-        raise ValueError(f"seed {reserved} is reserved for scores, as all from {EVALUATION_SEEDS.start} on: record smaller ones")
+        first = EVALUATION_SEEDS.start
+        raise ValueError(f"seed {reserved} is reserved for scores, as all from {first} on: record smaller ones")
     recorder, success_count = Recorder(env, read), 0
     with tqdm(seeds, unit="episode") as progress:
         for index, seed in enumerate(progress):

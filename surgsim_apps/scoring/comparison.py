@@ -1,7 +1,7 @@
 """Two methods on the same episodes: their difference, with its interval from a paired bootstrap."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,6 @@ class Difference:
         figure: a name of SHOWN
         first, second: the figure of each
         difference: first - second, with its interval; draws in which neither reaches the line are left out
-        ratio: first / second of presses, with its interval; None of other figures
         episode_count: of the same organs, that would show a difference of this size with a power of 80 % at 5 %;
             infinity without a difference, None of presses
     """
@@ -38,14 +37,15 @@ class Difference:
     first: float
     second: float
     difference: ScoreEstimate
-    ratio: ScoreEstimate | None = None
     episode_count: float | None = None
 
 
-def compare(first: Result, second: Result, rng: np.random.Generator) -> list[Difference]:
+def compare(
+    first: Result, second: Result, rng: np.random.Generator, figures: Collection[str] = tuple(SHOWN)
+) -> list[Difference]:
     """Differences of two results by a paired bootstrap (Efron & Tibshirani 1993, ch. 8).
 
-    A draw (`resamples`) takes the same episodes for both.
+    A draw (`resamples`) takes the same episodes for both. Of environments with control steps it compares `success`.
 
     Raises:
         ValueError: results of other seeds, environments or physics, or without single episodes (names both).
@@ -56,7 +56,7 @@ def compare(first: Result, second: Result, rng: np.random.Generator) -> list[Dif
     for fault in _faults(first, second):
         raise ValueError(f"{first.method} and {second.method} cannot be compared: {fault}: evaluate both again")
     draws = resamples(len(first.seeds), first.members, rng)
-    names = SHOWN if first.env_id == SITES else ("success",)
+    names = figures if first.env_id == SITES else ("success",)
     return [(_presses if name == "presses_to_median" else _means)(name, first, second, draws) for name in names]
 
 
@@ -66,9 +66,9 @@ def _means(name: str, first: Result, second: Result, draws: list[NDArray[np.intp
     paired = values[0] - values[1]
     drawn = np.array([paired[draw].mean() for draw in draws])
     difference, error = float(paired.mean()), float(drawn.std())
-    count = len(paired) * (POWER * error / difference) ** 2 if difference else math.inf
-    estimate = figure_with_interval(difference, drawn)
-    return Difference(name, *values.mean(axis=1).tolist(), estimate, episode_count=count)
+    steps = POWER * error / difference if difference else math.inf
+    estimate, (one, other) = figure_with_interval(difference, drawn), values.mean(axis=1).tolist()
+    return Difference(name, one, other, estimate, len(paired) * steps * steps)
 
 
 def _presses(name: str, first: Result, second: Result, draws: list[NDArray[np.intp]]) -> Difference:
@@ -76,15 +76,15 @@ def _presses(name: str, first: Result, second: Result, draws: list[NDArray[np.in
     values = np.array(
         [[median_presses(each.errors_mm, each.lesion_counts, sample) for sample in samples] for each in (first, second)]
     )
-    # Never less never, and never over never, is undefined: NaN.
+    # Never less never is undefined: NaN.
     with np.errstate(invalid="ignore"):
-        differences, ratios = values[0] - values[1], values[0] / values[1]
-    difference, ratio = (figure_with_interval(float(each[0]), each[1:]) for each in (differences, ratios))
-    return Difference(name, *values[:, 0].tolist(), difference, ratio)
+        differences = values[0] - values[1]
+    one, other = values[:, 0].tolist()
+    return Difference(name, one, other, figure_with_interval(float(differences[0]), differences[1:]))
 
 
 def describe(difference: Difference, first: str, second: str) -> str:
-    """One line: the figures of two methods, their difference, and a ratio of presses."""
+    """One line: the figures of two methods, their difference, and the episodes that tell them apart."""
     heading, digits, factor, unit = SHOWN[difference.figure]
 
     def shown(value: float | None, form: str = "") -> str:
@@ -96,9 +96,7 @@ def describe(difference: Difference, first: str, second: str) -> str:
     line = f"{heading}: {values}; difference {interval}{unit}"
     if difference.figure == "error_of_presses_mm" and math.isfinite(difference.episode_count or 0.0):
         line += f"; {difference.episode_count:.0f} episodes tell them apart (power 80 %, level 5 %)"
-    if difference.ratio is None or difference.ratio.value is None:
-        return line
-    return f"{line}; ratio {difference.ratio.value:.2f} ({difference.ratio.low:.2f} to {difference.ratio.high:.2f})"
+    return line
 
 
 def _faults(first: Result, second: Result) -> Iterator[str]:

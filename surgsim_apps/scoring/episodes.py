@@ -5,7 +5,7 @@ An agent draws from `agent_generator(seed)`, separate from all environments. Onl
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from surgsim_apps.scoring.figures import MapScore, PalpationRecord, press_errors
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation import HOLD_TIME, PRESS_SPEED
 from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
 from surgsim_env.tasks import SUCCESS_ERROR, PalpateSitesTask
 
@@ -52,7 +51,7 @@ def make_envs(
     return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
 
 
-def equal_members(stream: Iterable[int], count: int, size: int) -> tuple[int, ...]:
+def equal_members(stream: Iterator[int], count: int, size: int) -> tuple[int, ...]:
     """The first `count` seeds of a stream with a family's members in numbers that differ by at most 1.
 
     Args:
@@ -62,13 +61,11 @@ def equal_members(stream: Iterable[int], count: int, size: int) -> tuple[int, ..
     """
     whole, extra = divmod(count, size)
     counts, seeds = [0] * size, []
-    for seed in stream:
-        if len(seeds) == count:
-            break
+    while len(seeds) < count:
+        seed = next(stream)
         member = int(np.random.default_rng(seed).integers(size))
-        surplus = counts[member] == whole
-        if counts[member] < whole or (surplus and extra > 0):
-            extra -= surplus
+        if counts[member] < whole + (extra > 0):
+            extra -= counts[member] == whole
             counts[member] += 1
             seeds.append(seed)
     return tuple(seeds)
@@ -381,14 +378,13 @@ class SiteRecord:
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a press; the last one completes the record."""
         self.estimates.append(np.array(self.task.estimated if self.reference is None else self._own_places()))
-        felt = (float(info["force"]), float(info["force_peak"]), float(info["depth"]))
-        self.presses.append((*felt, *tissue_load_of(info)))
+        self.presses.append((float(info["force"]), float(info["force_peak"]), *tissue_load_of(info)))
         if over:
             self._complete(info)
 
     def _complete(self, info: dict[str, Any]) -> None:
         score = map_score(self.task)
-        force, peak, depth, pressure, strain = np.array(self.presses).T
+        force, peak, pressure, strain = np.array(self.presses).T
         self.record = PalpationRecord(
             truth=self.task.truth.copy(),
             estimates=self.estimates,
@@ -397,11 +393,7 @@ class SiteRecord:
             force_peak=peak,
             pressure=pressure,
             strain=strain,
-            # A linear ramp on the way in, then the hold.
-            impulse=float((force * (HOLD_TIME + 0.5 * np.maximum(depth, 0.0) / PRESS_SPEED)).sum()),
             seconds=float(info["seconds"]),
-            path_length=float(info["path_length"]),
-            soft_force=self.task.limits.soft_force,
             hard_limit=bool(info["hard_limit"]),
             fault=str(info["sim_fault"]),
             map=score if self.reference is None else self._own_map(score),

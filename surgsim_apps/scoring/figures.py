@@ -47,10 +47,7 @@ class PalpationRecord:
         cutoff: of OSPA [m]
         force, force_peak: of each press, held and largest [N]                                          (n,)
         pressure, strain: largest of the tissue at the end of each press [Pa], (1)                      (n,)
-        impulse: integral of the contact force over all presses [N s]
         seconds: simulated and counted time [s]
-        path_length: of the tip [m]
-        soft_force: the soft limit [N]
         hard_limit: True if a press passed the hard limit
         fault: of the simulation, or ""
         map: the last estimate as a map; None for methods with places alone
@@ -64,10 +61,7 @@ class PalpationRecord:
     force_peak: FloatArray
     pressure: FloatArray
     strain: FloatArray
-    impulse: float
     seconds: float
-    path_length: float
-    soft_force: float
     hard_limit: bool
     fault: str
     map: MapScore | None
@@ -189,26 +183,12 @@ def _outline_iou(record: PalpationRecord) -> float:
     return float((record.map.outline & record.map.outline_true).sum() / union)
 
 
-def _outline_difference_mm2(record: PalpationRecord) -> float:
-    if record.map is None:
-        return math.nan
-    return float((record.map.outline ^ record.map.outline_true).sum()) * record.map.cell_area * 1e6
-
-
 def _auroc(record: PalpationRecord) -> float:
     if record.map is None or record.map.lesion.all() or not record.map.lesion.any():
         return math.nan
     from sklearn.metrics import roc_auc_score
 
     return float(roc_auc_score(record.map.lesion, record.map.excess))
-
-
-def _average_precision(record: PalpationRecord) -> float:
-    if record.map is None or not record.map.lesion.any():
-        return math.nan
-    from sklearn.metrics import average_precision_score
-
-    return float(average_precision_score(record.map.lesion, record.map.excess))
 
 
 # One number per episode, NaN if undefined; a method's figure is their mean.
@@ -220,18 +200,12 @@ EPISODE_FIGURES: Mapping[str, Callable[[PalpationRecord], float]] = {
     ),
     "count_right": lambda record: float(len(record.estimates[-1]) == len(record.truth)),
     "outline_iou": _outline_iou,
-    "outline_difference_mm2": _outline_difference_mm2,
     "auroc": _auroc,
-    "average_precision": _average_precision,
     "force_mean": lambda record: float(record.force.mean()),
-    "force_p95": lambda record: float(np.percentile(record.force_peak, 95.0)),
     "force_peak": lambda record: float(record.force_peak.max()),
     "pressure_peak": lambda record: float(record.pressure.max()),
     "strain_peak": lambda record: float(record.strain.max()),
-    "soft_force_share": lambda record: float((record.force_peak > record.soft_force).mean()),
-    "impulse": lambda record: record.impulse,
     "seconds": lambda record: record.seconds,
-    "path_length": lambda record: record.path_length,
     "hard_limit_share": lambda record: float(record.hard_limit),
     "fault_share": lambda record: float(bool(record.fault)),
 }

@@ -197,42 +197,22 @@ class GpLevelSet(GpVariance):
         return np.minimum(excess + margin - level, level - excess + margin)
 
 
-class OracleSites(GpVariance):
-    """Presses at the least certain sites, and the true lesions last.
-
-    A bound for presses with the common estimator. Pressing around the lesions is worse: it leaves too few presses
-    elsewhere for the healthy tissue's background.
-    """
-
-    sees_truth: ClassVar[bool] = True
-
-    def see(self, task: PalpateSitesTask) -> None:
-        """Take the truth of the episode, after `reset`."""
-        places = [task.charted.chart.place(point) for point in task.truth]
-        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
-
-    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """The next press."""
-        left = self.process.facts.budget - self.count
-        action = super().act(observation)
-        return self.places[left - 1] if left <= len(self.places) else action
-
-
-class OracleNear(OracleSites):
-    """Presses the true lesions first, then a place far from all of them, then around each, then as `OracleSites`.
+class OracleNear(GpVariance):
+    """Presses the true lesions first, then a place far from all, then around each, then the least certain sites.
 
     A bound for the presses that locate lesions by the common estimator: a search has to find them first.
     """
 
+    sees_truth: ClassVar[bool] = True
     # Directions around a lesion, and the distance over the lesions' mean radius.
     around: ClassVar[NDArray[np.float64]] = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]])
     distance: ClassVar[float] = 0.9
 
     def see(self, task: PalpateSitesTask) -> None:
         """Take the truth of the episode, after `reset`."""
-        super().see(task)
         facts = self.process.facts
-        lesions = 0.5 * (np.array(self.places, dtype=np.float64).reshape(-1, 2) + 1.0) * facts.extent
+        places = [task.charted.chart.place(point) for point in task.truth]
+        lesions = 0.5 * (np.clip(np.reshape(places, (-1, 2)), -1.0, 1.0) + 1.0) * facts.extent
         squared = np.square(facts.sites[:, None] - lesions).sum(axis=2).min(axis=1, initial=np.inf)
         far = facts.sites[np.argmax(np.where(self.process.candidates, squared, -np.inf))]
         rings = [lesions + self.distance * facts.lesion_radius * way for way in self.around]
@@ -299,7 +279,6 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "gp_ei": GpEi,
     "gp_thompson": GpThompson,
     "gp_level_set": GpLevelSet,
-    "oracle": OracleSites,
     "oracle_near": OracleNear,
     "truth": TruthAgent,
     "middle": Middle,
@@ -308,4 +287,4 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
 # Methods with estimates regardless of their presses.
 REFERENCES = ("truth", "middle")
 # Methods with the truth, or without a search.
-BOUNDS = (*REFERENCES, "oracle", "oracle_near")
+BOUNDS = (*REFERENCES, "oracle_near")

@@ -114,11 +114,9 @@ class ContrastProcess:
         """
         prior, count = self.excess_covariance(points, points)[: len(points), : len(points)], len(places)
         variance = EXCESS_SPREAD * EXCESS_SPREAD + BACKGROUND_SPREAD * BACKGROUND_SPREAD + self.noise_variance
-        if count == 0:
-            return np.square(prior).sum(axis=0) / variance
         between = self.excess_covariance(points, places)[: len(points)]
         felt = between + BACKGROUND_SPREAD * BACKGROUND_SPREAD * (np.arange(between.shape[1]) < count)
-        weights = solve(self._covariance(places), felt.T)
+        weights = solve(self._covariance(places), felt.T) if count else felt.T
         left = variance - (felt * weights.T).sum(axis=1)
         return np.square(prior - matmul(between, weights)).sum(axis=0) / left
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgsim_apps.scoring.site_search import AGENTS, BOUNDS
+from surgsim_apps.scoring.site_search import AGENTS, BOUNDS, GpEi, GpEvr, GpThompson, OracleNear
 from surgsim_apps.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts, SiteProcess
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
@@ -110,7 +110,7 @@ def test_variance_reduction_leaves_the_least_variance() -> None:
     process = SiteProcess(FACTS)
     for count in (0, 1, 8):
         observation = pressed_chart(count).observation()
-        agent = AGENTS["gp_evr"]()
+        agent = GpEvr()
         agent.reset(np.random.default_rng(0), FACTS)
         chosen = int(FACTS.map.nearest(agent.act(observation)))
         places, pressed = FACTS.sites[process.touches(observation)[0]], observation[SLICES["pressed_map"]] > 0.5
@@ -119,14 +119,14 @@ def test_variance_reduction_leaves_the_least_variance() -> None:
             return np.square(process.process.spread(places).ravel()[process.candidates]).sum()
 
         fresh = np.flatnonzero(process.candidates & ~pressed)
-        left = {site: variance(np.vstack([places, FACTS.sites[site]])) for site in fresh}
+        left = {int(site): variance(np.vstack([places, FACTS.sites[site]])) for site in fresh}
         assert left[chosen] == pytest.approx(min(left.values()), rel=1e-9)
         assert variance(places) - agent.worth(observation)[chosen] == pytest.approx(left[chosen], rel=1e-9)
 
 
 def test_expected_improvement_is_the_mean_of_the_improvements() -> None:
     """Over draws of the normal distribution at each site."""
-    observation, agent = pressed_chart(8).observation(), AGENTS["gp_ei"]()
+    observation, agent = pressed_chart(8).observation(), GpEi()
     agent.reset(np.random.default_rng(0), FACTS)
     belief = agent.process.belief(observation)
     draws = belief.excess + belief.spread * np.random.default_rng(1).normal(size=(20_000, len(belief.excess)))
@@ -136,7 +136,7 @@ def test_expected_improvement_is_the_mean_of_the_improvements() -> None:
 
 @pytest.mark.parametrize("gradient_noise", [0.0, 5.0])
 def test_samples_have_the_mean_and_the_spread_of_the_posterior(gradient_noise: float) -> None:
-    observation, agent = pressed_chart(8).observation(), AGENTS["gp_thompson"]()
+    observation, agent = pressed_chart(8).observation(), GpThompson()
     if gradient_noise:
         observation = np.append(observation, np.zeros(2 * len(FACTS.sites) + 1, dtype=np.float32))
     agent.reset(np.random.default_rng(0), replace(FACTS, gradient_noise=gradient_noise))
@@ -155,22 +155,8 @@ def test_variance_reduction_fills_the_chart() -> None:
     assert gaps.max() < 0.010
 
 
-def test_the_oracle_presses_lesions_last() -> None:
-    agent = AGENTS["oracle"]()
-    agent.reset(np.random.default_rng(0), FACTS)
-    truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
-    chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
-    agent.see(SimpleNamespace(truth=truth, charted=SimpleNamespace(chart=chart)))
-    pressed = Chart([])
-    for _ in range(FACTS.budget):
-        pressed.press(agent.act(pressed.observation()))
-    np.testing.assert_allclose(pressed.places[-2:], truth[::-1, :2], atol=1e-8)
-    spread = np.array(pressed.places[:-2])
-    assert np.linalg.norm(spread[:, None] - spread, axis=2)[np.triu_indices(len(spread), 1)].min() > 0.004
-
-
 def test_the_near_oracle_presses_lesions_first() -> None:
-    agent = AGENTS["oracle_near"]()
+    agent = OracleNear()
     agent.reset(np.random.default_rng(0), FACTS)
     truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
     chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)

@@ -1,164 +1,174 @@
-"""Write agents/LEADERBOARD.md from the result files agents/results/*.json.
+"""Write docs/leaderboard.md from the result files agents/results/*.json.
 
 python -m agents.leaderboard
 """
 
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import astuple
+from collections.abc import Iterator, Sequence
+from itertools import combinations, groupby
 from pathlib import Path
+
+import numpy as np
 
 from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import output_folder
+from surgsim_apps.scoring.comparison import compare
+from surgsim_apps.scoring.evaluate import BOOTSTRAP_SEED
 from surgsim_apps.scoring.figures import ScoreEstimate
-from surgsim_apps.scoring.results import SITES, Result, load_results, seeds_text, shipped_results
+from surgsim_apps.scoring.results import SITES, Result, load_results, shipped_results
+from surgsim_apps.scoring.site_search import BOUNDS
 from surgsim_env.scene import PHYSICS_VERSION
 
-LEADERBOARD = Path(__file__).resolve().with_name("LEADERBOARD.md")
+LEADERBOARD = Path(__file__).resolve().parents[1] / "docs" / "leaderboard.md"
+# The figure that orders methods of PalpateSites.
+AREA = "error_of_presses_mm"
 
-# Columns: heading, figure, decimals, factor.
+# Columns: heading, figure, decimals, factor. The first has its interval.
 Column = tuple[str, str, int, float]
 LOAD: tuple[Column, ...] = (
-    ("peak tissue pressure [kPa]", "pressure_peak", 1, 0.001),
-    ("peak tissue strain", "strain_peak", 2, 1.0),
-)
-PLACES: tuple[Column, ...] = (
-    ("presses to 5 mm, median", "presses_to_median", 0, 1.0),
-    ("90th percentile", "presses_to_p90", 0, 1.0),
-    ("success [%]", "success", 0, 100.0),
-    ("error [mm]", "error_mm", 1, 1.0),
-    ("over all presses [mm]", "error_of_presses_mm", 1, 1.0),
-    ("centroid [mm]", "centroid_error_mm", 1, 1.0),
-    ("recall [%]", "recall", 0, 100.0),
-    ("precision [%]", "precision", 0, 100.0),
-    ("number right [%]", "count_right", 0, 100.0),
-)
-MAPS: tuple[Column, ...] = (
-    ("outline IoU", "outline_iou", 2, 1.0),
-    ("difference [mm^2]", "outline_difference_mm2", 0, 1.0),
-    ("AUROC", "auroc", 3, 1.0),
-    ("AP", "average_precision", 2, 1.0),
-    ("force mean [N]", "force_mean", 2, 1.0),
-    ("p95 [N]", "force_p95", 2, 1.0),
-    ("peak [N]", "force_peak", 2, 1.0),
-    *LOAD,
-    ("presses over soft limit [%]", "soft_force_share", 1, 100.0),
-    ("impulse [N s]", "impulse", 2, 1.0),
-    ("time [s]", "seconds", 0, 1.0),
-    ("path [m]", "path_length", 2, 1.0),
-    ("hard limit, faults [%]", "violations", 0, 100.0),
-)
-TASKS: tuple[Column, ...] = (
-    ("success [%]", "success", 0, 100.0),
-    ("time to success [s]", "seconds", 1, 1.0),
-    ("error [mm]", "error_mm", 1, 1.0),
     ("peak force [N]", "force_peak", 2, 1.0),
-    *LOAD,
-    ("under soft limit [%]", "under_soft_force", 0, 100.0),
-    ("torn [%]", "torn", 0, 100.0),
-    ("peak grip [N]", "grip_force_peak", 2, 1.0),
-    ("peak pull [N]", "pull_force_peak", 2, 1.0),
-    ("slips", "slips", 1, 1.0),
-    ("hard limit, faults [%]", "violations", 0, 100.0),
-    ("return", "return", 2, 1.0),
+    ("peak tissue pressure [kPa]", "pressure_peak", 1, 0.001),
 )
-
-
-def write_leaderboard(folder: Path, path: Path) -> None:
-    """Write the tables of all results of a folder."""
-    results = load_results(folder)
-    places = sorted(sorted({result.place for result in results}), key=_order)
-    parts = [HEADER]
-    for place in places:
-        rows = [result for result in results if result.place == place]
-        parts.append(_sites(rows) if rows[0].env_id == SITES else _tasks(rows))
-    parts.append(_commands(results))
-    with output_folder(path.parent) as files:
-        (files / path.name).write_text("\n".join(parts), encoding="utf-8")
-
+PRESSES: tuple[Column, ...] = (
+    ("area under the error curve [mm]", AREA, 2, 1.0),
+    ("presses to 5 mm", "presses_to_median", 0, 1.0),
+    ("success [%]", "success", 0, 100.0),
+    ("error [mm]", "error_mm", 1, 1.0),
+    *LOAD,
+)
+STEPS: tuple[Column, ...] = (("success [%]", "success", 0, 100.0), ("time to success [s]", "seconds", 1, 1.0), *LOAD)
+NOTES = {
+    "random": "what the common estimator gives without a search",
+    "sites_evolved": "learned acquisition function: 13 numbers in JSON",
+    "oracle_near": "presses lesions first, then around them",
+    "middle": "blind guess",
+}
 
 HEADER = f"""# Leaderboard
 
-Written by `python -m agents.leaderboard` from `agents/results/*.json`; definitions in `docs/palpation.md`.
-Each figure is a mean over the episodes of its seeds, in brackets the 95 % bootstrap interval over them; "never" is a
-line that was not reached within the presses of an episode. Baselines and policies play the same organs. The rasters
-shown are the best of those tried, by presses to 5 mm, then by the error over all presses. Methods marked
-**sees truth** know what is hidden: `truth` reports it, the oracles press with that knowledge. Where the patient moves,
-presses and oracles track the surface by markers; methods whose name ends in `untracked` press at the rest position.
-How to score an agent of your own: `docs/own_agent.md`. Differences between two methods on the same organs:
-`surgsim evaluate --compare A.json B.json`, for results of one version of the physics. The engine has physics
-{PHYSICS_VERSION}; a method with "physics" and another number was played on an older one and not since.
+In `SurgSim/PalpateSites-v0` an agent chooses where to press an organ, and one common estimator locates the
+lesions. Methods are ordered by the **area under the error curve**: the error (OSPA) of the estimated lesions after each
+press, averaged over presses and episodes, with its 95 % bootstrap interval, over organs where there are several. All
+methods of a table play the same episodes; of the rasters the best is shown. Definitions: `docs/palpation.md`.
+
+"never": not within the presses of an episode. **sees truth**: the method knows the lesions. The engine has physics
+{PHYSICS_VERSION}; "physics" with another number: played on an older version and not since. `openhelp_...` are organs of
+one CT scan (`docs/patient.md`). `python -m agents.leaderboard` writes this page from `agents/results/*.json`, which
+have the numbers of each episode, the intervals of all figures and the command of each row.
+"""
+BLOCKS = """
+## Blocks: a smoke test
+
+Random presses with the common estimator close most of the way from the blind guess here: a block shows that a method
+works, not that it is better. Rank methods on organs.
+"""
+SUBMISSION = """
+## How to submit
+
+Write a class with two methods and run `surgsim evaluate --agent my_agent:Mine --scene liver_family --submit`
+(`docs/own_agent.md`). The seeds follow from the digest of the agent's file: nobody can choose an agent by its score on
+them. `surgsim evaluate --compare A.json B.json` prints how two methods differ on the same episodes, and how many
+episodes would tell them apart.
+
+## What a score does not exclude
+
+* An agent's code runs beside the environment's: nothing stops code that reads the simulation. Read the agent's file.
+* The reward of a press is its true error, and `info` contains the truth. Agents that are scored get neither, but one
+  that was trained on rewards has learned from the truth.
+* An agent may report its own estimate instead of the common estimator's: the row says **own estimate**.
+* The seeds of the rows on this page are public.
 """
 
 
-def _order(place: str) -> tuple[int, str]:
-    levels = ("standard", "easy", "hard", "clinical")
-    ranks = [index for index, level in enumerate(levels) if place.endswith(level)]
-    return (0 if place.startswith("PalpateSites") else 1, f"{place.rsplit('_', 1)[0]}{ranks[0] if ranks else 9}")
+def write_leaderboard(folder: Path, path: Path) -> None:
+    """Write the page of all results of a folder."""
+    results = sorted(load_results(folder), key=_order)
+    parts = [HEADER]
+    for is_block, group in groupby((row for row in results if row.env_id == SITES), key=_is_block):
+        parts += [BLOCKS] * is_block
+        parts += [_presses(list(rows)) for _, rows in groupby(group, key=lambda row: row.place)]
+    parts.append(SUBMISSION)
+    for env_id, rows in groupby((row for row in results if row.env_id != SITES), key=lambda row: row.env_id):
+        parts.append(f"\n## `{env_id}`\n\n{_table(list(rows), STEPS)}\n")
+    with output_folder(path.parent) as files:
+        (files / path.name).write_text("".join(parts), encoding="utf-8")
 
 
-def ranked(rows: Sequence[Result]) -> list[Result]:
-    """The leaderboard's rows of one place, best first, with the best raster alone."""
-    if rows[0].env_id == SITES:
-        return sorted(best_raster_alone(rows), key=_merit)
-    return sorted(rows, key=lambda result: -(result.figures["success"].value or 0.0))
+def _is_block(result: Result) -> bool:
+    return result.scene.startswith("phantom")
 
 
-def _sites(rows: list[Result]) -> str:
-    rows = ranked(rows)
-    first = max(rows, key=lambda row: row.budget)
-    lesions = first.lesion_counts
-    organs = (
-        f"{len(lesions)} organs (seeds {seeds_text(first.seeds)}), {sum(lesions)} lesions, "
-        f"{lesions.count(0)} organs without one; {first.budget} presses.\n"
-    )
-    parts = [f"\n## {_title(first)}\n", organs, _table(rows, PLACES), "", _table(rows, MAPS)]
-    return "\n".join(parts)
+def _order(result: Result) -> tuple:
+    """Families, then single organs, then blocks; the best first."""
+    if result.env_id != SITES:
+        return (True, result.env_id, result.place, -_value(result, "success"))
+    return (False, _is_block(result), not result.members, result.place, _value(result, AREA))
 
 
-def _tasks(rows: list[Result]) -> str:
-    rows = ranked(rows)
-    used = [column for column in TASKS if any(column[1] in _figures(row) for row in rows)]
-    first = rows[0]
-    seeds = f"{len(first.seeds)} episodes (seeds from {first.seeds[0]}), at most {first.budget} control steps.\n"
-    return "\n".join([f"\n## {_title(rows[0])}\n", seeds, _table(rows, used)])
-
-
-def _title(result: Result) -> str:
-    scene, level = result.scene, result.env_kwargs.get("level")
-    moves = f"motion {result.motion}" * bool(result.motion)
-    details = ", ".join(part for part in (level, moves) if part)
-    return " ".join(part for part in (f"`{result.env_id}`", scene, f"({details})" if details else "") if part)
+def _value(result: Result, figure: str) -> float:
+    value = result.figures[figure].value
+    return math.inf if value is None else value
 
 
 def best_raster_alone(rows: Sequence[Result]) -> list[Result]:
     """The rows with the best raster only."""
     rasters = [row for row in rows if row.method.startswith("raster_")]
-    if not rasters:
-        return list(rows)
-    best = min(rasters, key=_merit)
+    best = min(rasters, key=lambda row: _value(row, AREA), default=None)
     return [row for row in rows if row not in rasters or row is best]
 
 
-def _merit(result: Result) -> tuple[float, float]:
-    presses, error = result.figures["presses_to_median"].value, result.figures["error_of_presses_mm"].value
-    return (math.inf if presses is None else presses, math.inf if error is None else error)
+def _presses(rows: list[Result]) -> str:
+    rows = best_raster_alone(rows)
+    first = max(rows, key=lambda row: row.budget)
+    lesions = first.lesion_counts
+    organs = f" of {len(set(first.members))} organs" if first.members else " on one organ"
+    text = (
+        f"\n{'#' * (3 if _is_block(first) else 2)} {_title(first)}\n\n{len(lesions)} episodes{organs}, {sum(lesions)} "
+        f"lesions, {lesions.count(0)} episodes without one, {first.budget} presses.\n\n{_table(rows, PRESSES)}\n"
+    )
+    return text if _is_block(first) else text + "".join(f"\n{line}\n" for line in _head_room(rows))
 
 
-def _figures(result: Result) -> dict[str, ScoreEstimate]:
-    """The figures, with hard limits and faults summed."""
-    both = [astuple(result.figures[name]) for name in ("hard_limit_share", "fault_share")]
-    return {
-        **result.figures,
-        "violations": ScoreEstimate(*((a or 0.0) + (b or 0.0) for a, b in zip(*both, strict=True))),
-    }
+def _head_room(rows: Sequence[Result]) -> Iterator[str]:
+    """Sentences on what would beat the methods of a place, and which of them are not separated."""
+    by_name = {row.method: row for row in rows}
+    searches = [row for row in rows if row.method not in BOUNDS]
+    near = by_name.get("oracle_near")
+    if near is not None and searches and near.physics_version == searches[0].physics_version:
+        gap = _value(searches[0], AREA) - _value(near, AREA)
+        exact = min((row for row in rows if not row.own_estimate), key=lambda row: _value(row, "error_mm"))
+        yield (
+            f"**Head room**: {gap:.2f} mm of area between {searches[0].method} and oracle_near, which presses the "
+            f"lesions first. No method has come below {_value(exact, 'error_mm'):.1f} mm after the last press "
+            f"({exact.method}): what the estimator leaves."
+        )
+    alike = []
+    for first, second in combinations(searches, 2):
+        if (first.seeds, first.budget, first.physics_version) != (second.seeds, second.budget, second.physics_version):
+            continue
+        (area,) = compare(first, second, np.random.default_rng(BOOTSTRAP_SEED), [AREA])
+        low, high = area.difference.low, area.difference.high
+        if low is not None and high is not None and low <= 0.0 <= high:
+            alike.append(f"{first.method} and {second.method} ({area.difference.value:+.2f} mm)")
+    if alike:
+        yield f"**Not separated** by the area (95 % interval of the paired difference with 0): {', '.join(alike)}."
+
+
+def _title(result: Result) -> str:
+    split, motion = result.env_kwargs.get("split"), result.motion
+    details = (result.env_kwargs.get("level"), split and f"{split} split", motion and f"motion {motion}")
+    in_brackets = ", ".join(filter(None, details))
+    return f"`{result.scene}` ({in_brackets})".removesuffix(" ()").removeprefix("``").strip()
 
 
 def _table(rows: Sequence[Result], columns: Sequence[Column]) -> str:
-    head = ["method", *(column[0] for column in columns)]
+    scene = columns is STEPS
+    head = [*["scene"] * scene, "method", *(column[0] for column in columns), "note"]
     lines = [_line(head), _line(["---"] * len(head))]
-    lines += [_line([_name(row), *(_cell(_figures(row), column) for column in columns)]) for row in rows]
+    for row in rows:
+        cells = [_cell(row.figures.get(column[1]), column, index == 0) for index, column in enumerate(columns)]
+        lines.append(_line([*[_title(row)] * scene, _name(row), *cells, _note(row)]))
     return "\n".join(lines)
 
 
@@ -168,32 +178,26 @@ def _line(cells: Sequence[str]) -> str:
 
 def _name(result: Result) -> str:
     side = result.method.removeprefix("raster_")
-    name = f"raster {side} x {side}" if side != result.method else result.method
-    older = f" (physics {result.physics_version})" * (result.physics_version != PHYSICS_VERSION)
-    return name + " **sees truth**" * result.sees_truth + " (own estimate)" * result.own_estimate + older
+    return f"raster {side} x {side}" if side != result.method else result.method
 
 
-def _cell(figures: dict[str, ScoreEstimate], column: Column) -> str:
-    _, name, decimals, factor = column
-    figure = figures.get(name)
+def _note(result: Result) -> str:
+    marks = ("**sees truth**" * result.sees_truth, "**own estimate**" * result.own_estimate)
+    older = f"physics {result.physics_version}" if result.physics_version != PHYSICS_VERSION else ""
+    return ", ".join(note for note in (NOTES.get(result.method), *marks, older) if note)
+
+
+def _cell(figure: ScoreEstimate | None, column: Column, interval: bool) -> str:
     if figure is None or figure.value is None:
         return ""
-    value, low, high = (_number(number, decimals, factor) for number in (figure.value, figure.low, figure.high))
-    return value if value == low == high else f"{value} ({low} to {high})"
+    value, low, high = (_number(number, column) for number in (figure.value, figure.low, figure.high))
+    return f"{value} ({low} to {high})" if interval else value
 
 
-def _number(value: float | None, decimals: int, factor: float) -> str:
+def _number(value: float | None, column: Column) -> str:
     if value is None:
         return ""
-    return "never" if math.isinf(value) else f"{value * factor:.{decimals}f}"
-
-
-def _commands(results: Sequence[Result]) -> str:
-    lines = ["\n## Commands\n", _line(["command", "wall time [s]", "date", "physics"]), _line(["---"] * 4)]
-    lines += [
-        _line([f"`{row.command}`", f"{row.wall_time:.0f}", row.date, str(row.physics_version)]) for row in results
-    ]
-    return "\n".join([*lines, "", "Wall times were measured on a 2-core machine under other load.", ""])
+    return "never" if math.isinf(value) else f"{value * column[3]:.{column[2]}f}"
 
 
 if __name__ == "__main__":

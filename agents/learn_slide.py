@@ -203,7 +203,8 @@ def train(
             network.eval()
             scores = {least: sum(values) / len(values) for least, values in check(network, checked).items()}
             best = max(scores, key=scores.__getitem__)
-            print(f"step {step}: loss {float(loss.detach()):.3f}, check {scores[best]:.3f} at threshold {best}", flush=True)
+            lost = float(loss.detach())
+            print(f"step {step}: loss {lost:.3f}, check {scores[best]:.3f} at threshold {best}", flush=True)
             network.train()
     return network.eval()
 

@@ -189,9 +189,10 @@ def record(
     Raises:
         ValueError: seeds reserved for scores.
     """
-    reserved = next((seed for seed in seeds if seed in EVALUATION_SEEDS), None)
+    reserved = next((seed for seed in seeds if seed >= EVALUATION_SEEDS.start), None)
     if reserved is not None:
-        raise ValueError(f"seed {reserved} is reserved for scores, as all in {EVALUATION_SEEDS}: record other seeds")
+        first = EVALUATION_SEEDS.start
+        raise ValueError(f"seed {reserved} is reserved for scores, as all from {first} on: record smaller ones")
     recorder, success_count = Recorder(env, read), 0
     with tqdm(seeds, unit="episode") as progress:
         for index, seed in enumerate(progress):

@@ -75,7 +75,10 @@ UNFIXED_ROUNDING: dict[str, tuple[tuple[str, ...], str]] = {
     "surgsim_apps/patient/label_image.py": (("sum",), "counts"),
     "surgsim_apps/patient/lesion_room.py": (("sum",), "counts"),
     "surgsim_env/scene/model.py": (("sum",), "counts"),
-    "surgsim_apps/scoring/site_search.py": (("scipy.stats",), "Sobol's sequence, of whole numbers"),
+    "surgsim_apps/scoring/site_search.py": (
+        ("scipy.stats",),
+        "Sobol's whole numbers; maxima of an expected improvement",
+    ),
     "surgsim_env/scripting/run.py": (("sum",), "counts"),
 }
 

@@ -16,13 +16,12 @@ ROOT = Path(__file__).resolve().parents[2]
 # Where each stands in the repository, and its place on the site.
 OUTSIDE = {
     "agents/README.md": "agents.md",
-    "agents/LEADERBOARD.md": "leaderboard.md",
     "scenes/README.md": "scenes.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }
 # Pages of large tables, which commands write.
-WIDE = {"validation.md", "benchmarks.md", "leaderboard.md"}
+WIDE = {"validation.md", "benchmarks.md"}
 
 NAMED = re.compile(r"(?:docs|agents|scenes)/[\w/]+\.md|CONTRIBUTING\.md|CHANGELOG\.md")
 # A span of code, which is a link where it is such a path and nothing else; or a path in plain text, outside of links.

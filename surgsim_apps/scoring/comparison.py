@@ -1,23 +1,24 @@
 """Two methods on the same episodes: their difference, with its interval from a paired bootstrap."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_apps.scoring.figures import RESAMPLES, ScoreEstimate, figure_with_interval, presses_to_line
+from surgsim_apps.scoring.figures import ScoreEstimate, figure_with_interval, median_presses, resamples
 from surgsim_apps.scoring.results import SITES, Result, seeds_text
 
 # Heading, digits, factor and unit of each figure.
 SHOWN = {
+    "error_of_presses_mm": ("error over all presses", 2, 1.0, " mm"),
     "presses_to_median": ("presses to 5 mm", 1, 1.0, ""),
-    "error_mm": ("error", 2, 1.0, " mm"),
+    "error_mm": ("error after the last", 2, 1.0, " mm"),
     "success": ("success", 0, 100.0, " %"),
 }
-# A figure of one result over drawn episodes.
-Figure = Callable[[Result, NDArray[np.intp]], float]
+# Standard errors between a difference and 0 for a power of 80 % at 5 %, two-sided: normal quantiles 1.96 + 0.84.
+POWER = 2.8
 
 
 @dataclass(frozen=True)
@@ -28,52 +29,62 @@ class Difference:
         figure: a name of SHOWN
         first, second: the figure of each
         difference: first - second, with its interval; draws in which neither reaches the line are left out
-        ratio: first / second of presses, with its interval; None of other figures
+        episode_count: of the same organs, that would show a difference of this size with a power of 80 % at 5 %;
+            infinity without a difference, None of presses
     """
 
     figure: str
     first: float
     second: float
     difference: ScoreEstimate
-    ratio: ScoreEstimate | None
+    episode_count: float | None = None
 
 
-def compare(first: Result, second: Result, rng: np.random.Generator) -> list[Difference]:
+def compare(
+    first: Result, second: Result, rng: np.random.Generator, figures: Collection[str] = tuple(SHOWN)
+) -> list[Difference]:
     """Differences of two results by a paired bootstrap (Efron & Tibshirani 1993, ch. 8).
 
-    A draw takes the same episodes, with replacement, for both.
+    A draw (`resamples`) takes the same episodes for both. Of environments with control steps it compares `success`.
 
     Raises:
         ValueError: results of other seeds, environments or physics, or without single episodes (names both).
     """
     for result in (first, second):
-        if not result.successes:
+        if not result.episodes:
             raise ValueError(f"the result of {result.method} does not list its episodes: evaluate it again")
     for fault in _faults(first, second):
         raise ValueError(f"{first.method} and {second.method} cannot be compared: {fault}: evaluate both again")
-    figures: dict[str, Figure] = {"success": _success}
-    if first.env_id == SITES:
-        figures = {"presses_to_median": _presses, "error_mm": _error, **figures}
-    count = len(first.seeds)
-    draws = [rng.integers(count, size=count) for _ in range(RESAMPLES)]
-    return [_difference(name, figure, first, second, draws) for name, figure in figures.items()]
+    draws = resamples(len(first.seeds), first.members, rng)
+    names = figures if first.env_id == SITES else ("success",)
+    return [(_presses if name == "presses_to_median" else _means)(name, first, second, draws) for name in names]
 
 
-def _difference(name: str, figure: Figure, first: Result, second: Result, draws: list[NDArray[np.intp]]) -> Difference:
-    episodes = np.arange(len(first.seeds))
-    value, other = figure(first, episodes), figure(second, episodes)
-    values = np.array([(figure(first, draw), figure(second, draw)) for draw in draws])
-    ratio = None
-    # Never less never, and never over never, is undefined: NaN.
+def _means(name: str, first: Result, second: Result, draws: list[NDArray[np.intp]]) -> Difference:
+    """Means of one number per episode; the count of episodes is n (POWER se / difference)^2."""
+    values = np.array([first.episodes[name], second.episodes[name]], dtype=np.float64)
+    paired = values[0] - values[1]
+    drawn = np.array([paired[draw].mean() for draw in draws])
+    difference, error = float(paired.mean()), float(drawn.std())
+    steps = POWER * error / difference if difference else math.inf
+    estimate, (one, other) = figure_with_interval(difference, drawn), values.mean(axis=1).tolist()
+    return Difference(name, one, other, estimate, len(paired) * steps * steps)
+
+
+def _presses(name: str, first: Result, second: Result, draws: list[NDArray[np.intp]]) -> Difference:
+    samples = [np.arange(len(first.seeds)), *draws]
+    values = np.array(
+        [[median_presses(each.errors_mm, each.lesion_counts, sample) for sample in samples] for each in (first, second)]
+    )
+    # Never less never is undefined: NaN.
     with np.errstate(invalid="ignore"):
-        difference = figure_with_interval(value - other, values[:, 0] - values[:, 1])
-        if name == "presses_to_median":
-            ratio = figure_with_interval(float(np.divide(value, other)), values[:, 0] / values[:, 1])
-    return Difference(name, value, other, difference, ratio)
+        differences = values[0] - values[1]
+    one, other = values[:, 0].tolist()
+    return Difference(name, one, other, figure_with_interval(float(differences[0]), differences[1:]))
 
 
 def describe(difference: Difference, first: str, second: str) -> str:
-    """One line: the figures of two methods, their difference, and a ratio of presses."""
+    """One line: the figures of two methods, their difference, and the episodes that tell them apart."""
     heading, digits, factor, unit = SHOWN[difference.figure]
 
     def shown(value: float | None, form: str = "") -> str:
@@ -83,9 +94,9 @@ def describe(difference: Difference, first: str, second: str) -> str:
     interval = f"{shown(estimate.value, '+')} ({shown(estimate.low, '+')} to {shown(estimate.high, '+')})"
     values = f"{first} {shown(difference.first)}, {second} {shown(difference.second)}{unit}"
     line = f"{heading}: {values}; difference {interval}{unit}"
-    if difference.ratio is None or difference.ratio.value is None:
-        return line
-    return f"{line}; ratio {difference.ratio.value:.2f} ({difference.ratio.low:.2f} to {difference.ratio.high:.2f})"
+    if difference.figure == "error_of_presses_mm" and math.isfinite(difference.episode_count or 0.0):
+        line += f"; {difference.episode_count:.0f} episodes tell them apart (power 80 %, level 5 %)"
+    return line
 
 
 def _faults(first: Result, second: Result) -> Iterator[str]:
@@ -95,17 +106,3 @@ def _faults(first: Result, second: Result) -> Iterator[str]:
         yield f"they played {first.place} with {first.budget} steps and {second.place} with {second.budget}"
     if first.physics_version != second.physics_version:
         yield f"their physics versions are {first.physics_version} and {second.physics_version}"
-
-
-def _presses(result: Result, episodes: NDArray[np.intp]) -> float:
-    """Presses until the median error over the organs with lesions is and stays at most 5 mm."""
-    counted = episodes[np.array(result.lesion_counts)[episodes] > 0]
-    return presses_to_line(0.001 * np.array(result.errors_mm)[counted], 50.0) if len(counted) else math.nan
-
-
-def _error(result: Result, episodes: NDArray[np.intp]) -> float:
-    return float(np.array(result.errors_mm)[episodes, -1].mean())
-
-
-def _success(result: Result, episodes: NDArray[np.intp]) -> float:
-    return float(np.array(result.successes)[episodes].mean())

@@ -1,4 +1,4 @@
-"""Episodes of given seeds, played in vectorised environments and recorded, and the figures of a policy.
+"""Episodes of given seeds, played in vectorised environments and recorded, and the numbers of each.
 
 An agent draws from `agent_generator(seed)`, separate from all environments. Only an agent of a class that declares
 `sees_truth = True` gets the task with the truth, by its method `see`.
@@ -6,7 +6,7 @@ An agent draws from `agent_generator(seed)`, separate from all environments. Onl
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,9 +14,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from surgsim_apps.scoring.figures import MapScore, PalpationRecord, ScoreEstimate, press_errors, with_intervals
+from surgsim_apps.scoring.figures import MapScore, PalpationRecord, press_errors
 from surgsim_apps.training.site_agent import site_facts
-from surgsim_env.palpation import HOLD_TIME, PRESS_SPEED
 from surgsim_env.scripting import ScriptError, oracle_script, run_script, selected_observations
 from surgsim_env.tasks import SUCCESS_ERROR, PalpateSitesTask
 
@@ -51,6 +50,26 @@ def make_envs(
     lanes = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "Disabled", "dtype": dtype}
     kwargs["measure_tissue"] = True
     return gym.make_vec(env_id, num_envs=count, threads=threads, **lanes, **kwargs)
+
+
+def equal_members(stream: Iterator[int], count: int, size: int) -> tuple[int, ...]:
+    """The first `count` seeds of a stream with a family's members in numbers that differ by at most 1.
+
+    Args:
+        stream: of seeds, without end.
+        count: of episodes.
+        size: members of the family; an environment draws one by the first number of `default_rng(seed)`.
+    """
+    whole, extra = divmod(count, size)
+    counts, seeds = [0] * size, []
+    while len(seeds) < count:
+        seed = next(stream)
+        member = int(np.random.default_rng(seed).integers(size))
+        if counts[member] < whole + (extra > 0):
+            extra -= counts[member] == whole
+            counts[member] += 1
+            seeds.append(seed)
+    return tuple(seeds)
 
 
 def agent_generator(seed: int) -> np.random.Generator:
@@ -280,16 +299,15 @@ def play_scripts(
     return records
 
 
-def task_figures(
-    records: Sequence[TaskRecord], control_step: float, soft_force: float, rng: np.random.Generator
-) -> dict[str, ScoreEstimate]:
-    """The figures of a policy, with bootstrap intervals over episodes.
+def task_columns(
+    records: Sequence[TaskRecord], control_step: float, soft_force: float
+) -> dict[str, NDArray[np.float64]]:
+    """One number per episode (n,) of each figure of a policy, NaN if undefined.
 
     Args:
         records: at least one.
         control_step: duration of a step [s].
         soft_force: [N]; limit of the force in a gentle episode.
-        rng: for the bootstrap.
     """
     succeeded = [bool(record.last["success"]) for record in records]
     loads = np.array([np.max(record.loads, axis=0) for record in records])
@@ -322,7 +340,7 @@ def task_figures(
     if "error_mm" in records[0].last:
         errors = [float(record.last["error_mm"]) for record in records]
         columns["error_mm"] = [error if error >= 0.0 else math.nan for error in errors]
-    return with_intervals({name: np.array(values, dtype=np.float64) for name, values in columns.items()}, rng)
+    return {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
 
 
 # ---- SurgSim/PalpateSites-v0 ----------------------------------------------------------------------------------------
@@ -370,14 +388,13 @@ class SiteRecord:
     def note(self, reward: float, info: dict[str, Any], over: bool) -> None:
         """Add a press; the last one completes the record."""
         self.estimates.append(np.array(self.task.estimated if self.reference is None else self._own_places()))
-        felt = (float(info["force"]), float(info["force_peak"]), float(info["depth"]))
-        self.presses.append((*felt, *tissue_load_of(info)))
+        self.presses.append((float(info["force"]), float(info["force_peak"]), *tissue_load_of(info)))
         if over:
             self._complete(info)
 
     def _complete(self, info: dict[str, Any]) -> None:
         score = map_score(self.task)
-        force, peak, depth, pressure, strain = np.array(self.presses).T
+        force, peak, pressure, strain = np.array(self.presses).T
         self.record = PalpationRecord(
             truth=self.task.truth.copy(),
             estimates=self.estimates,
@@ -386,14 +403,11 @@ class SiteRecord:
             force_peak=peak,
             pressure=pressure,
             strain=strain,
-            # A linear ramp on the way in, then the hold.
-            impulse=float((force * (HOLD_TIME + 0.5 * np.maximum(depth, 0.0) / PRESS_SPEED)).sum()),
             seconds=float(info["seconds"]),
-            path_length=float(info["path_length"]),
-            soft_force=self.task.limits.soft_force,
             hard_limit=bool(info["hard_limit"]),
             fault=str(info["sim_fault"]),
             map=score if self.reference is None else self._own_map(score),
+            member=str(info.get("member", "")),
         )
 
     def _own_places(self) -> NDArray[np.float64]:

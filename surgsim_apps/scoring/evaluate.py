@@ -11,7 +11,7 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from surgsim_apps.scoring.episodes import (
     TaskRecord,
     check_agent,
     episode_facts,
+    equal_members,
     estimates_itself,
     make_envs,
     play_scripts,
@@ -35,11 +36,11 @@ from surgsim_apps.scoring.episodes import (
     play_tasks,
     sees_truth,
     site_success,
-    task_figures,
+    task_columns,
 )
 from surgsim_apps.scoring.expert_palpate import PalpateExpert
 from surgsim_apps.scoring.expert_retract import RetractExpert
-from surgsim_apps.scoring.figures import PalpationRecord, press_errors, score, with_intervals
+from surgsim_apps.scoring.figures import EVALUATION_SEEDS, PalpationRecord, episode_columns, press_errors, score
 from surgsim_apps.scoring.options import ScoringOptions
 from surgsim_apps.scoring.results import (
     SITES,
@@ -347,7 +348,6 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     kwargs, env_id, actor = _arguments(player, options), player.env_id, player.actor
     suffixes = ("untracked" * options.no_tracking, Path(options.instrument or "").stem)
     name = "_".join([player.name, *filter(None, suffixes)])
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
     count = 1 if actor is None else min(options.envs, len(options.played_seeds))
     try:
         envs = make_envs(env_id, count, dtype=options.dtype, threads=options.threads, **kwargs)
@@ -360,13 +360,13 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     start = time.perf_counter()
     with StepProgress(console) as shown, shown.step(f"{name}, {len(seeds)} episodes", total=len(seeds)) as ended:
         if actor is not None and env_id == SITES:
-            succeeded, scored = _site_scores(play_sites(actor, envs, seeds, ended), first.task, rng)
+            scored = _site_scores(play_sites(actor, envs, seeds, ended), first.task)
         elif actor is not None:
-            succeeded, scored = _task_scores(play_tasks(actor, envs, seeds, ended), first, rng)
+            scored = _task_scores(play_tasks(actor, envs, seeds, ended), first)
         else:
             single = gym.make(env_id, measure_tissue=True, **kwargs)
             records = play_scripts(single, seeds, tracks=not options.no_tracking, progress=ended)
-            succeeded, scored = _task_scores(records, first, rng)
+            scored = _task_scores(records, first)
     wall_time = time.perf_counter() - start
     envs.close()
     result = Result(
@@ -378,7 +378,6 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
         wall_time=round(wall_time, 1),
         date=datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         physics_version=PHYSICS_VERSION,
-        successes=succeeded,
         sees_truth=player.sees_truth,
         own_estimate=player.own_estimate,
         agent_digest=player.digest,
@@ -387,7 +386,7 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
     path = _write(result, player, options)
     values = {name: figure.value for name, figure in result.figures.items()}
     printed = (
-        *("presses_to_median", "presses_to_p90", "error_mm", "success", "seconds"),
+        *("error_of_presses_mm", "presses_to_median", "error_mm", "success", "seconds"),
         *("force_peak", "pressure_peak", "strain_peak", "torn"),
     )
     figures = ", ".join(f"{name} {values[name]:.3g}" for name in printed if values.get(name) is not None)
@@ -398,31 +397,43 @@ def evaluate(player: Player, options: ScoringOptions, console: Console) -> Resul
 
 
 def _seeds(player: Player, options: ScoringOptions, env: Any) -> tuple[int, ...]:
-    """Seeds of the episodes: as many of a submission as the options have."""
-    if not options.submit:
+    """Seeds of the episodes, of a family as many of each member unless the options name them."""
+    if options.seeds is not None:
         return options.played_seeds
-    level = "" if env.task.level is None else env.task.level.name
-    stream = submission_seeds(player.digest, player.env_id, env.scene.name, level)
-    return tuple(itertools.islice(stream, len(options.played_seeds)))
+    stream: Iterator[int] = itertools.count(EVALUATION_SEEDS.start)
+    if options.submit:
+        level = "" if env.task.level is None else env.task.level.name
+        stream = submission_seeds(player.digest, player.env_id, env.scene.name, level)
+    count, family = len(options.played_seeds), env.runtime.family
+    return tuple(itertools.islice(stream, count) if family is None else equal_members(stream, count, family.size))
 
 
-def _site_scores(presses: list[PalpationRecord], task: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
-    """Success of each episode of presses, and their entries of a `Result`."""
-    succeeded = [site_success(record, task) for record in presses]
-    share = {"success": np.array(succeeded, dtype=np.float64)}
-    return succeeded, {
-        "budget": task.budget,
-        "figures": {**score(presses, task.budget, rng), **with_intervals(share, rng)},
-        "errors_mm": [np.round(1000.0 * press_errors(record, task.budget), 2).tolist() for record in presses],
-        "lesion_counts": [len(record.truth) for record in presses],
-    }
+def _site_scores(presses: list[PalpationRecord], task: Any) -> dict[str, Any]:
+    """Entries of a `Result` by episodes of presses."""
+    succeeded = np.array([site_success(record, task) for record in presses], dtype=np.float64)
+    errors = [np.round(1000.0 * press_errors(record, task.budget), 2).tolist() for record in presses]
+    columns = {**episode_columns(presses, task.budget), "success": succeeded}
+    members = [record.member for record in presses]
+    return _scores(task.budget, columns, members, errors_mm=errors, lesion_counts=[len(each.truth) for each in presses])
 
 
-def _task_scores(records: list[TaskRecord], env: Any, rng: np.random.Generator) -> tuple[list[bool], dict]:
-    """Success of each episode of control steps, and their entries of a `Result`."""
-    return [bool(record.last["success"]) for record in records], {
-        "budget": env.task.episode_steps or 0,
-        "figures": task_figures(records, env.scene.timing.control_step, env.scene.limits.soft_force, rng),
+def _task_scores(records: list[TaskRecord], env: Any) -> dict[str, Any]:
+    """Entries of a `Result` by episodes of control steps."""
+    columns = task_columns(records, env.scene.timing.control_step, env.scene.limits.soft_force)
+    return _scores(env.task.episode_steps or 0, columns, [record.last.get("member", "") for record in records])
+
+
+def _scores(budget: int, columns: dict[str, Any], members: list[str], **presses: Any) -> dict[str, Any]:
+    members = members if any(members) else []
+    return {
+        "budget": budget,
+        "figures": score(columns, members, np.random.default_rng(BOOTSTRAP_SEED), **presses),
+        "episodes": {
+            name: [None if math.isnan(value) else float(f"{value:.5g}") for value in values]
+            for name, values in columns.items()
+        },
+        "members": members,
+        **presses,
     }
 
 

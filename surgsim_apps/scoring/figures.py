@@ -1,4 +1,4 @@
-"""Figures of a method of palpation over many organs, with their bootstrap intervals."""
+"""Figures of a method over many episodes, with their bootstrap intervals."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -47,13 +47,11 @@ class PalpationRecord:
         cutoff: of OSPA [m]
         force, force_peak: of each press, held and largest [N]                                          (n,)
         pressure, strain: largest of the tissue at the end of each press [Pa], (1)                      (n,)
-        impulse: integral of the contact force over all presses [N s]
         seconds: simulated and counted time [s]
-        path_length: of the tip [m]
-        soft_force: the soft limit [N]
         hard_limit: True if a press passed the hard limit
         fault: of the simulation, or ""
         map: the last estimate as a map; None for methods with places alone
+        member: of a family of organs, or ""
     """
 
     truth: FloatArray
@@ -63,13 +61,11 @@ class PalpationRecord:
     force_peak: FloatArray
     pressure: FloatArray
     strain: FloatArray
-    impulse: float
     seconds: float
-    path_length: float
-    soft_force: float
     hard_limit: bool
     fault: str
     map: MapScore | None
+    member: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,40 +77,56 @@ class ScoreEstimate:
     high: float | None
 
 
-def score(records: Sequence[PalpationRecord], budget: int, rng: np.random.Generator) -> dict[str, ScoreEstimate]:
-    """Figures of a method over its episodes, each with its interval over organs (Efron 1979, percentiles).
+def score(
+    columns: Mapping[str, FloatArray],
+    members: Sequence[str],
+    rng: np.random.Generator,
+    errors_mm: Sequence[Sequence[float]] = (),
+    lesion_counts: Sequence[int] = (),
+) -> dict[str, ScoreEstimate]:
+    """Figures of a method over its episodes, each with its bootstrap interval (Efron 1979, percentiles).
 
-    Errors are in mm. `presses_to_median`, `presses_to_p90`, recall, centroid error, outline and map are over organs
-    with a lesion; `precision` is over those with an estimate.
+    Args:
+        columns: by name one number per episode (n,), NaN if undefined; their means are figures.
+        members: of a family of organs, one per episode, or empty (`resamples`).
+        rng: for the bootstrap.
+        errors_mm: OSPA after each press of each episode, (n, n_press), for the figure `presses_to_median`.
+        lesion_counts: of each of these episodes, (n,).
     """
-    errors = np.array([press_errors(record, budget) for record in records])
-    columns = {"error_mm": errors[:, -1] * 1000.0, "error_of_presses_mm": errors.mean(axis=1) * 1000.0}
-    columns |= {name: np.array([of(record) for record in records]) for name, of in EPISODE_FIGURES.items()}
     table = np.array(list(columns.values()))
-    has_lesion = np.array([len(record.truth) > 0 for record in records])
 
     def figures(sample: NDArray[np.intp]) -> dict[str, float]:
         values = dict(zip(columns, _means(table[:, sample]).tolist(), strict=True))
-        with_lesion = errors[sample[has_lesion[sample]]]
-        for name, percentile in (("presses_to_median", 50.0), ("presses_to_p90", 90.0)):
-            values[name] = presses_to_line(with_lesion, percentile) if len(with_lesion) else math.nan
-        values["error_median_mm"] = float(np.median(with_lesion[:, -1])) * 1000.0 if len(with_lesion) else math.nan
+        if len(errors_mm):
+            values["presses_to_median"] = median_presses(errors_mm, lesion_counts, sample)
         return values
 
-    whole = figures(np.arange(len(records)))
-    draws = [figures(rng.integers(len(records), size=len(records))) for _ in range(RESAMPLES)]
+    count = table.shape[1]
+    whole = figures(np.arange(count))
+    draws = [figures(sample) for sample in resamples(count, members, rng)]
     return {
         name: figure_with_interval(value, np.array([draw[name] for draw in draws])) for name, value in whole.items()
     }
 
 
-def with_intervals(columns: Mapping[str, FloatArray], rng: np.random.Generator) -> dict[str, ScoreEstimate]:
-    """Means over episodes, with intervals, of one number per episode (n,), NaN if undefined."""
-    table = np.array(list(columns.values()))
-    count = table.shape[1]
-    draws = np.array([_means(table[:, rng.integers(count, size=count)]) for _ in range(RESAMPLES)])
-    means = _means(table).tolist()
-    return {name: figure_with_interval(mean, draw) for name, mean, draw in zip(columns, means, draws.T, strict=True)}
+def resamples(count: int, members: Sequence[str], rng: np.random.Generator) -> list[NDArray[np.intp]]:
+    """Episodes of each draw of the bootstrap, numbers below `count`.
+
+    Episodes of one member of a family are alike: a draw is of members with replacement and takes all episodes of each
+    (cluster bootstrap, Field & Welsh 2007, "Bootstrapping clustered data"). Without members, on one organ with lesions
+    of its own in each episode, a draw is of episodes.
+    """
+    names = np.array(members)
+    clusters = [np.flatnonzero(names == name) for name in dict.fromkeys(members)] or list(np.arange(count)[:, None])
+    draws = rng.integers(len(clusters), size=(RESAMPLES, len(clusters)))
+    return [np.concatenate([clusters[number] for number in draw]) for draw in draws]
+
+
+def episode_columns(records: Sequence[PalpationRecord], budget: int) -> dict[str, FloatArray]:
+    """One number per episode (n,) of each figure, NaN if undefined; errors in mm."""
+    errors = 1000.0 * np.array([press_errors(record, budget) for record in records])
+    columns = {"error_of_presses_mm": errors.mean(axis=1), "error_mm": errors[:, -1]}
+    return columns | {name: np.array([of(record) for record in records]) for name, of in EPISODE_FIGURES.items()}
 
 
 def press_errors(record: PalpationRecord, budget: int) -> FloatArray:
@@ -123,17 +135,21 @@ def press_errors(record: PalpationRecord, budget: int) -> FloatArray:
     return np.array(errors + [errors[-1]] * (budget - len(errors)))
 
 
-def presses_to_line(errors: FloatArray, percentile: float) -> float:
-    """Presses until a percentile of the errors over organs is and stays at most ERROR_LINE; infinity if never.
+def median_presses(
+    errors_mm: Sequence[Sequence[float]], lesion_counts: Sequence[int], episodes: NDArray[np.intp]
+) -> float:
+    """Presses until the median error over the episodes with lesions is and stays at most ERROR_LINE.
 
-    Args:
-        errors: after each press [m], shape (n_organ, n_press).
-        percentile: 50 for the median, 90 for the bad cases.
+    Infinity if never, NaN without such an episode.
     """
-    above = np.flatnonzero(np.percentile(errors, percentile, axis=0) > ERROR_LINE)
+    counted = episodes[np.asarray(lesion_counts)[episodes] > 0]
+    if len(counted) == 0:
+        return math.nan
+    medians = np.median(np.asarray(errors_mm)[counted], axis=0)
+    above = np.flatnonzero(0.001 * medians > ERROR_LINE)
     if len(above) == 0:
         return 1.0
-    return float(above[-1] + 2) if above[-1] + 1 < errors.shape[1] else math.inf
+    return float(above[-1] + 2) if above[-1] + 1 < len(medians) else math.inf
 
 
 def _means(values: FloatArray) -> FloatArray:
@@ -167,26 +183,12 @@ def _outline_iou(record: PalpationRecord) -> float:
     return float((record.map.outline & record.map.outline_true).sum() / union)
 
 
-def _outline_difference_mm2(record: PalpationRecord) -> float:
-    if record.map is None:
-        return math.nan
-    return float((record.map.outline ^ record.map.outline_true).sum()) * record.map.cell_area * 1e6
-
-
 def _auroc(record: PalpationRecord) -> float:
     if record.map is None or record.map.lesion.all() or not record.map.lesion.any():
         return math.nan
     from sklearn.metrics import roc_auc_score
 
     return float(roc_auc_score(record.map.lesion, record.map.excess))
-
-
-def _average_precision(record: PalpationRecord) -> float:
-    if record.map is None or not record.map.lesion.any():
-        return math.nan
-    from sklearn.metrics import average_precision_score
-
-    return float(average_precision_score(record.map.lesion, record.map.excess))
 
 
 # One number per episode, NaN if undefined; a method's figure is their mean.
@@ -198,18 +200,12 @@ EPISODE_FIGURES: Mapping[str, Callable[[PalpationRecord], float]] = {
     ),
     "count_right": lambda record: float(len(record.estimates[-1]) == len(record.truth)),
     "outline_iou": _outline_iou,
-    "outline_difference_mm2": _outline_difference_mm2,
     "auroc": _auroc,
-    "average_precision": _average_precision,
     "force_mean": lambda record: float(record.force.mean()),
-    "force_p95": lambda record: float(np.percentile(record.force_peak, 95.0)),
     "force_peak": lambda record: float(record.force_peak.max()),
     "pressure_peak": lambda record: float(record.pressure.max()),
     "strain_peak": lambda record: float(record.strain.max()),
-    "soft_force_share": lambda record: float((record.force_peak > record.soft_force).mean()),
-    "impulse": lambda record: record.impulse,
     "seconds": lambda record: record.seconds,
-    "path_length": lambda record: record.path_length,
     "hard_limit_share": lambda record: float(record.hard_limit),
     "fault_share": lambda record: float(bool(record.fault)),
 }

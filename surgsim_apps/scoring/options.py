@@ -27,7 +27,7 @@ class ScoringOptions:
     no_tracking: bool = False
     """Presses and oracles go where the surface is at rest, as it moves."""
     seeds: str | None = None
-    """FIRST:LAST or A,B,C; default: the evaluation seeds."""
+    """FIRST:LAST or A,B,C; default: the evaluation seeds, of a family as many of each member."""
     submit: bool = False
     """Play seeds that follow from the digest of the agent's or policy's files (docs/own_agent.md)."""
     episodes: int | None = None
@@ -71,7 +71,7 @@ class ScoringOptions:
     @property
     def standard(self) -> bool:
         """True for results as shipped: of all evaluation seeds, with the default presses and lanes."""
-        all_seeds = self.played_seeds == tuple(EVALUATION_SEEDS)
+        all_seeds = self.seeds is None and len(self.played_seeds) == len(EVALUATION_SEEDS)
         return all_seeds and not self.submit and self.budget is None and self.dtype == type(self).dtype
 
     @cached_property

@@ -28,11 +28,12 @@ class Result:
         seeds: of the episodes; in a file as text, "FIRST:LAST" or "A,B,C"
         budget: largest number of steps of an episode
         figures: by name, each a value with its interval
-        successes: success of each episode
+        episodes: by name of a figure one number per episode, None if undefined; the figure is their mean
         command: the command line of the evaluation
         wall_time: of all episodes [s], on a machine with other load
         date: of its end
         physics_version: of the engine (`surgsim_env.scene.digest`)
+        members: of a family of organs, one per episode; empty for a scene of one organ
         errors_mm: OSPA after each press of each episode (PalpateSites only)
         lesion_counts: lesions of each episode (PalpateSites only)
         sees_truth: True if the method declares that it sees hidden truth
@@ -50,9 +51,10 @@ class Result:
     wall_time: float
     date: str
     physics_version: int
+    episodes: dict[str, list[float | None]] = field(default_factory=dict)
+    members: list[str] = field(default_factory=list)
     errors_mm: list[list[float]] = field(default_factory=list)
     lesion_counts: list[int] = field(default_factory=list)
-    successes: list[bool] = field(default_factory=list)
     sees_truth: bool = False
     own_estimate: bool = False
     agent_digest: str = ""

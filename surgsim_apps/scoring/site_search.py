@@ -4,21 +4,28 @@ Searches use observations and the size of the chart only (`SiteFacts`). Methods 
 `sees_truth`. The belief of the searches `gp_*` is a Gaussian process on log contrast.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
+from scipy.stats import norm, qmc
 
+from msdm_core.arithmetic import cos, matmul, sin
 from surgsim_apps.scoring.figures import MapScore
-from surgsim_apps.training.site_agent import Belief, SiteAgent, SiteFacts, SiteProcess
+from surgsim_apps.training.site_agent import SiteAgent, SiteFacts, SiteProcess
+from surgsim_env.palpation import BACKGROUND_SPREAD, EXCESS_SPREAD
 from surgsim_env.tasks import PalpateSitesTask
 
 # Parameters of GP-UCB and of the level-set search, chosen on organs outside all evaluations (docs/palpation.md).
 UCB_BETA = 3.0
 LEVEL_BETA, LEVEL_SHARE = 2.0, 0.55
+# Above so many candidates `GpEvr` takes every second one: its time grows with their square.
+EVR_SITES_MOST = 400
+# Waves in a sample of the prior by `GpThompson`.
+WAVE_COUNT = 256
 # The points of the face [m] (k, 3) at places of the chart (k, 2), each in [-1, 1].
 Surface = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -96,11 +103,29 @@ class GpVariance:
         self.count += 1
         if first is not None:
             return first
-        return self.process.best(self.worth(self.process.belief(observation)), observation, self.rng)
+        return self.process.best(self.worth(observation), observation, self.rng)
 
-    def worth(self, belief: Belief) -> NDArray[np.float64]:
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
         """The acquisition function at each site (n n,)."""
-        return belief.spread
+        return self.process.belief(observation).spread
+
+
+class GpEvr(GpVariance):
+    """Expected variance reduction (Cohn 1996; Seo et al. 2000): the press that leaves the least variance on the chart.
+
+    Like the deviation it does not depend on the measured contrast.
+    """
+
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The decrease of the variance, summed over the candidates; 0 elsewhere."""
+        sites = np.flatnonzero(self.process.candidates)
+        if len(sites) > EVR_SITES_MOST:
+            # A checkerboard: rows have an odd number of sites.
+            sites = sites[sites % 2 == 0]
+        pressed, points = self.process.touches(observation)[0], self.process.facts.sites
+        worth = np.zeros(len(points))
+        worth[sites] = self.process.process.variance_reduction(points[pressed], points[sites])
+        return worth
 
 
 class GpUcb(GpVariance):
@@ -108,9 +133,49 @@ class GpUcb(GpVariance):
 
     begins_with_raster = True
 
-    def worth(self, belief: Belief) -> NDArray[np.float64]:
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
         """The upper confidence bound."""
+        belief = self.process.belief(observation)
         return belief.excess + UCB_BETA * belief.spread
+
+
+class GpEi(GpVariance):
+    """Expected improvement (Jones et al. 1998) over the largest expected excess."""
+
+    begins_with_raster = True
+
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The improvement's expectation d P(z) + s p(z), z = d / s, by the normal distribution P and its density p."""
+        belief = self.process.belief(observation)
+        gain = belief.excess - belief.excess[self.process.candidates].max()
+        ratio = gain / np.maximum(belief.spread, 1e-9)
+        return gain * norm.cdf(ratio) + belief.spread * norm.pdf(ratio)
+
+
+class GpThompson(GpVariance):
+    """Posterior sampling (Thompson 1933; Kandasamy et al. 2018): the maximum of one sample of the excess.
+
+    The sample is a sum of random waves of the prior (Rahimi & Recht 2007), corrected by the process of the difference
+    between what was felt and the same presses on the sample (Wilson et al. 2020, "Efficiently sampling functions from
+    Gaussian process posteriors").
+    """
+
+    begins_with_raster = True
+
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The sample."""
+        process, facts, rng = self.process.process, self.process.facts, self.rng
+        pressed, values, gradients = self.process.touches(observation)
+        waves, phases = rng.normal(size=(2, WAVE_COUNT)) / process.length, rng.uniform(0.0, 2.0 * math.pi, WAVE_COUNT)
+        scale, pressable = EXCESS_SPREAD * math.sqrt(2.0 / WAVE_COUNT), facts.map.pressable
+        sample = np.zeros(len(facts.sites))
+        sample[pressable] = scale * cos(matmul(facts.sites[pressable], waves) + phases).sum(axis=1)
+        noise = rng.normal(scale=math.sqrt(process.noise_variance), size=len(pressed))
+        felt = sample[pressed] + rng.normal(scale=BACKGROUND_SPREAD) + noise
+        if gradients is not None:
+            slopes = -scale * matmul(sin(matmul(facts.sites[pressed], waves) + phases), waves.T)
+            gradients = gradients - rng.normal(slopes, math.sqrt(process.gradient_variance))
+        return sample + process.mean(facts.sites[pressed], values - felt, gradients)[1].ravel()
 
 
 class GpLevelSet(GpVariance):
@@ -124,49 +189,30 @@ class GpLevelSet(GpVariance):
 
     begins_with_raster = True
 
-    def worth(self, belief: Belief) -> NDArray[np.float64]:
+    def worth(self, observation: NDArray[np.floating]) -> NDArray[np.float64]:
         """The ambiguity; the level is at least the estimator's least excess of a lesion."""
+        belief = self.process.belief(observation)
         excess, margin = belief.excess, LEVEL_BETA * belief.spread
         level = max(self.process.facts.excess_least, LEVEL_SHARE * float(excess[self.process.candidates].max()))
         return np.minimum(excess + margin - level, level - excess + margin)
 
 
-class OracleSites(GpVariance):
-    """Presses at the least certain sites, and the true lesions last.
-
-    A bound for presses with the common estimator. Pressing around the lesions is worse: it leaves too few presses
-    elsewhere for the healthy tissue's background.
-    """
-
-    sees_truth: ClassVar[bool] = True
-
-    def see(self, task: PalpateSitesTask) -> None:
-        """Take the truth of the episode, after `reset`."""
-        places = [task.charted.chart.place(point) for point in task.truth]
-        self.places = [np.clip(place, -1.0, 1.0).astype(np.float32) for place in places]
-
-    def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
-        """The next press."""
-        left = self.process.facts.budget - self.count
-        action = super().act(observation)
-        return self.places[left - 1] if left <= len(self.places) else action
-
-
-class OracleNear(OracleSites):
-    """Presses the true lesions first, then a place far from all of them, then around each, then as `OracleSites`.
+class OracleNear(GpVariance):
+    """Presses the true lesions first, then a place far from all, then around each, then the least certain sites.
 
     A bound for the presses that locate lesions by the common estimator: a search has to find them first.
     """
 
+    sees_truth: ClassVar[bool] = True
     # Directions around a lesion, and the distance over the lesions' mean radius.
     around: ClassVar[NDArray[np.float64]] = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]])
     distance: ClassVar[float] = 0.9
 
     def see(self, task: PalpateSitesTask) -> None:
         """Take the truth of the episode, after `reset`."""
-        super().see(task)
         facts = self.process.facts
-        lesions = 0.5 * (np.array(self.places, dtype=np.float64).reshape(-1, 2) + 1.0) * facts.extent
+        places = [task.charted.chart.place(point) for point in task.truth]
+        lesions = 0.5 * (np.clip(np.reshape(places, (-1, 2)), -1.0, 1.0) + 1.0) * facts.extent
         squared = np.square(facts.sites[:, None] - lesions).sum(axis=2).min(axis=1, initial=np.inf)
         far = facts.sites[np.argmax(np.where(self.process.candidates, squared, -np.inf))]
         rings = [lesions + self.distance * facts.lesion_radius * way for way in self.around]
@@ -228,10 +274,11 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
     "random": RandomSites,
     **{f"raster_{side}": lambda side=side: RasterSites(side) for side in RASTER_SIDES},
     "sobol": SobolSites,
-    "gp_variance": GpVariance,
+    "gp_evr": GpEvr,
     "gp_ucb": GpUcb,
+    "gp_ei": GpEi,
+    "gp_thompson": GpThompson,
     "gp_level_set": GpLevelSet,
-    "oracle": OracleSites,
     "oracle_near": OracleNear,
     "truth": TruthAgent,
     "middle": Middle,
@@ -240,4 +287,4 @@ AGENTS: dict[str, Callable[[], SiteAgent]] = {
 # Methods with estimates regardless of their presses.
 REFERENCES = ("truth", "middle")
 # Methods with the truth, or without a search.
-BOUNDS = (*REFERENCES, "oracle", "oracle_near")
+BOUNDS = (*REFERENCES, "oracle_near")

@@ -145,16 +145,23 @@ class SiteProcess:
         from_border = np.minimum(facts.sites, facts.extent - facts.sites) / facts.extent
         self.candidates = facts.map.pressable & (from_border.min(axis=1) >= BORDER)
 
+    def touches(
+        self, observation: NDArray[np.floating]
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64] | None]:
+        """Numbers of the pressed sites (n,), the log contrast (n,) and, with taxels, its gradient [1/m] (n, 2)."""
+        pressed, values = remembered(observation)
+        if not self.facts.gradient_noise:
+            return pressed, values, None
+        parts = np.asarray(observation[SLICES["gradient_map"]], dtype=np.float64).reshape(2, -1)
+        return pressed, values, parts[:, pressed].T / self.facts.tip_radius
+
     def belief(self, observation: NDArray[np.floating]) -> Belief:
         """The belief given all presses in an observation.
 
         It is about the excess alone: uncertainty of the background, the same at all sites, should attract no press.
         """
-        pressed, values = remembered(observation)
-        places, gradients = self.facts.sites[pressed], None
-        if self.facts.gradient_noise:
-            parts = np.asarray(observation[SLICES["gradient_map"]], dtype=np.float64).reshape(2, -1)
-            gradients = parts[:, pressed].T / self.facts.tip_radius
+        pressed, values, gradients = self.touches(observation)
+        places = self.facts.sites[pressed]
         excess = self.process.mean(places, values, gradients)[1]
         return Belief(excess.ravel(), self.process.spread(places).ravel())
 

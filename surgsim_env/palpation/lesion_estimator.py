@@ -102,6 +102,24 @@ class ContrastProcess:
         variance = EXCESS_SPREAD * EXCESS_SPREAD - (explained * between).sum(axis=1)
         return np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
 
+    def variance_reduction(self, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Decrease of the excess' variance, summed over points, by a further press at each of them, shape (k,).
+
+        sum over x' of cov(e(x'), y(x))^2 / var(y(x)), given the presses (Cohn 1996; Seo et al. 2000); of the further
+        press the log contrast alone counts.
+
+        Args:
+            places: of the presses [m], shape (n, 2).
+            points: on the chart [m], shape (k, 2).
+        """
+        prior, count = self.excess_covariance(points, points)[: len(points), : len(points)], len(places)
+        variance = EXCESS_SPREAD * EXCESS_SPREAD + BACKGROUND_SPREAD * BACKGROUND_SPREAD + self.noise_variance
+        between = self.excess_covariance(points, places)[: len(points)]
+        felt = between + BACKGROUND_SPREAD * BACKGROUND_SPREAD * (np.arange(between.shape[1]) < count)
+        weights = solve(self._covariance(places), felt.T) if count else felt.T
+        left = variance - (felt * weights.T).sum(axis=1)
+        return np.square(prior - matmul(between, weights)).sum(axis=0) / left
+
     @property
     def _derivatives(self) -> tuple[tuple[int, int], ...]:
         """Orders of the measured derivatives along the chart's first and second axis."""

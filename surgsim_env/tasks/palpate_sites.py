@@ -28,7 +28,7 @@ from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward,
 from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
 # Presses of an episode; BUDGET_WIDE where the chart's longer side exceeds WIDE tip radii.
-BUDGET, BUDGET_WIDE, WIDE = 25, 60, 10.0
+BUDGET, BUDGET_WIDE, WIDE = 25, 40, 10.0
 # OSPA at which an episode succeeds [m], under a tip of REFERENCE_TIP; in proportion under others.
 SUCCESS_ERROR = 0.005
 # Bound of the observed depth over the scene's press depth.
@@ -118,7 +118,7 @@ class PalpateSitesTask(Task):
     * `track_motion`: a press goes with the surface as a camera's markers show it (default), or to where it is at rest.
     * `level`: "easy", "standard" (default), "hard" or "clinical".
     * `memory`: observe all presses (default), or the last one alone.
-    * `budget`: presses of an episode; by default 25, or 60 where the chart is longer than ten tip radii.
+    * `budget`: presses of an episode; by default 25, or 40 where the chart is longer than ten tip radii.
     * `split`: "train" (default), "validation" or "test": members of a family of organs, such as scene "liver_family",
       of which each episode draws one; `info["member"]` names it.
     * `instrument`: "probe", "tactile_probe" (a probe with taxels), the name of an arm or the path of an arm's TOML
@@ -268,7 +268,7 @@ class PalpateSitesTask(Task):
         Args:
             scenario: with a level.
             memory: observe all presses; else the last one alone.
-            budget: presses of an episode; by default 25, or 60 where the chart's longer side is above ten tip radii.
+            budget: presses of an episode; by default 25, or 40 where the chart's longer side is above ten tip radii.
             track_motion: presses follow a moving surface.
 
         Raises:

@@ -17,13 +17,14 @@ from surgsim_apps.scoring.episodes import (
     agent_generator,
     check_agent,
     episode_facts,
+    equal_members,
     make_envs,
     play_sites,
     play_tasks,
     site_success,
 )
 from surgsim_apps.scoring.figures import EVALUATION_SEEDS, MapScore, press_errors
-from surgsim_apps.scoring.site_search import Middle, OracleSites, RandomSites, TruthAgent
+from surgsim_apps.scoring.site_search import Middle, OracleNear, RandomSites, TruthAgent
 from surgsim_apps.scoring.submission import SEED_LEAST, submission_seeds
 from surgsim_env.rendering import gl
 from surgsim_env.tasks.palpate import EPISODE_STEPS
@@ -64,6 +65,20 @@ def test_its_stream_is_none_of_the_environments_or_their_children():
 def test_it_does_not_hold_the_seed():
     sequence: Any = agent_generator(1_000_000).bit_generator.seed_seq
     assert 1_000_000 not in np.atleast_1d(sequence.entropy) and sequence.spawn_key == ()
+
+
+def test_members_of_a_family_play_in_equal_numbers():
+    """Of 3 members 40 episodes: 13 each and one more; every seed that is passed over is of a full member."""
+    seeds = equal_members(itertools.count(1_000_000), 40, 3)
+    members = {seed: int(np.random.default_rng(seed).integers(3)) for seed in range(1_000_000, seeds[-1] + 1)}
+    counts = [0, 0, 0]
+    for seed, member in members.items():
+        if seed in seeds:
+            counts[member] += 1
+        else:
+            assert counts[member] == 14 or (counts[member] == 13 and 14 in counts), seed
+    assert sorted(counts) == [13, 13, 14] and len(seeds) == 40 < len(members)
+    assert equal_members(itertools.count(5), 4, 1) == (5, 6, 7, 8)
 
 
 # ---- lanes -----------------------------------------------------------------------------------------------------------
@@ -214,7 +229,7 @@ def test_the_truth_is_for_those_that_declare_it():
     with pytest.raises(ValueError, match=r"Peeking has a method see, .* does not declare sees_truth = True"):
         check_agent(Peeking(), "Peeking")
     begun(Peeking, env)
-    assert len(begun(OracleSites, env).places) == len(env.unwrapped.task.truth)  # type: ignore[attr-defined]
+    assert len(begun(OracleNear, env).first_places) == 1 + 4 * len(env.unwrapped.task.truth)  # type: ignore[attr-defined]
     np.testing.assert_array_equal(begun(TruthAgent, env).truth, env.unwrapped.task.truth)  # type: ignore[attr-defined]
 
 

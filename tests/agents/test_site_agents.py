@@ -1,12 +1,13 @@
 """The baselines of SurgSim/PalpateSites-v0, on maps made of bell curves: what they press, and that they find."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from surgsim_apps.scoring.site_search import AGENTS, BOUNDS
-from surgsim_apps.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts
+from surgsim_apps.scoring.site_search import AGENTS, BOUNDS, GpEi, GpEvr, GpThompson, OracleNear
+from surgsim_apps.training.site_agent import OBSERVATION_SIZE, SLICES, SiteFacts, SiteProcess
 from surgsim_env.palpation.chart import MAP_SIDE, TouchMap
 from surgsim_env.palpation.lesion_estimator import LesionEstimator
 
@@ -93,31 +94,69 @@ def test_what_is_felt_draws_presses(name: str, inner: float, outer: float) -> No
         distance = np.linalg.norm(played(name, Chart([tuple(centre)], noise=0.05)) - centre, axis=1)
         return int(((distance > inner) & (distance < outer)).sum())
 
-    assert between(name) >= between("gp_variance") + 2
+    assert between(name) >= between("gp_evr") + 2
+
+
+def pressed_chart(count: int) -> Chart:
+    """A chart with presses at random places, on the sites of the map."""
+    chart, places = Chart([(0.027, 0.013)], noise=0.05), np.random.default_rng(7).permutation(FACTS.sites[FACE.ravel()])
+    for place in places[:count]:
+        chart.press(FACTS.action(place))
+    return chart
+
+
+def test_variance_reduction_leaves_the_least_variance() -> None:
+    """Against the sum of the process' own variances after each possible press."""
+    process = SiteProcess(FACTS)
+    for count in (0, 1, 8):
+        observation = pressed_chart(count).observation()
+        agent = GpEvr()
+        agent.reset(np.random.default_rng(0), FACTS)
+        chosen = int(FACTS.map.nearest(agent.act(observation)))
+        places, pressed = FACTS.sites[process.touches(observation)[0]], observation[SLICES["pressed_map"]] > 0.5
+
+        def variance(places: np.ndarray) -> float:
+            return np.square(process.process.spread(places).ravel()[process.candidates]).sum()
+
+        fresh = np.flatnonzero(process.candidates & ~pressed)
+        left = {int(site): variance(np.vstack([places, FACTS.sites[site]])) for site in fresh}
+        assert left[chosen] == pytest.approx(min(left.values()), rel=1e-9)
+        assert variance(places) - agent.worth(observation)[chosen] == pytest.approx(left[chosen], rel=1e-9)
+
+
+def test_expected_improvement_is_the_mean_of_the_improvements() -> None:
+    """Over draws of the normal distribution at each site."""
+    observation, agent = pressed_chart(8).observation(), GpEi()
+    agent.reset(np.random.default_rng(0), FACTS)
+    belief = agent.process.belief(observation)
+    draws = belief.excess + belief.spread * np.random.default_rng(1).normal(size=(20_000, len(belief.excess)))
+    gains = np.maximum(draws - belief.excess[agent.process.candidates].max(), 0.0)
+    np.testing.assert_allclose(agent.worth(observation), gains.mean(axis=0), atol=5.0 * gains.std() / np.sqrt(20_000))
+
+
+@pytest.mark.parametrize("gradient_noise", [0.0, 5.0])
+def test_samples_have_the_mean_and_the_spread_of_the_posterior(gradient_noise: float) -> None:
+    observation, agent = pressed_chart(8).observation(), GpThompson()
+    if gradient_noise:
+        observation = np.append(observation, np.zeros(2 * len(FACTS.sites) + 1, dtype=np.float32))
+    agent.reset(np.random.default_rng(0), replace(FACTS, gradient_noise=gradient_noise))
+    belief, inside = agent.process.belief(observation), agent.process.candidates
+    samples = np.array([agent.worth(observation)[inside] for _ in range(1000)])
+    spread = belief.spread[inside]
+    assert (np.abs(samples.mean(axis=0) - belief.excess[inside]) < 5.0 * spread / np.sqrt(1000)).all()
+    # The deviation of a deviation from n normal draws is sigma / sqrt(2 n).
+    np.testing.assert_allclose(samples.std(axis=0), spread, rtol=5.0 / np.sqrt(2000))
 
 
 def test_variance_reduction_fills_the_chart() -> None:
     """No candidate is farther from a press than one correlation length after 25 presses."""
-    places = played("gp_variance", Chart([(0.027, 0.013)]))
+    places = played("gp_evr", Chart([(0.027, 0.013)]))
     gaps = np.linalg.norm(FACTS.sites[FACTS.map.pressable][:, None] - places, axis=2).min(axis=1)
     assert gaps.max() < 0.010
 
 
-def test_the_oracle_presses_lesions_last() -> None:
-    agent = AGENTS["oracle"]()
-    agent.reset(np.random.default_rng(0), FACTS)
-    truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
-    chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)
-    agent.see(SimpleNamespace(truth=truth, charted=SimpleNamespace(chart=chart)))
-    pressed = Chart([])
-    for _ in range(FACTS.budget):
-        pressed.press(agent.act(pressed.observation()))
-    np.testing.assert_allclose(pressed.places[-2:], truth[::-1, :2], atol=1e-8)
-    np.testing.assert_array_equal(pressed.places[:-2], played("gp_variance", Chart([]))[:-2])
-
-
 def test_the_near_oracle_presses_lesions_first() -> None:
-    agent = AGENTS["oracle_near"]()
+    agent = OracleNear()
     agent.reset(np.random.default_rng(0), FACTS)
     truth = np.array([[0.010, 0.020, 0.0], [0.030, 0.030, 0.0]])
     chart = SimpleNamespace(extent=np.array(FACTS.extent), place=lambda point: point[:2] / 0.02 - 1.0)

@@ -289,7 +289,7 @@ def test_a_fault_ends_the_episode_with_the_last_finite_observation():
 def test_the_budget_of_a_wide_scene_is_larger(monkeypatch):
     flat = healthy_module.HealthyMap(np.full((25, 25, 3), 55.0))
     monkeypatch.setattr(palpate_sites, "healthy_map_of", lambda *_: flat)
-    assert gym.make(ID, scene="phantom_wide").unwrapped.task.budget == 60
+    assert gym.make(ID, scene="phantom_wide").unwrapped.task.budget == 40
     assert gym.make(ID, scene="phantom_wide", budget=7).unwrapped.task.budget == 7
 
 

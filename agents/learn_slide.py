@@ -26,7 +26,7 @@ import surgsim_env  # noqa: F401  (registers the ids)
 from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.training.slide_agents import LESION_RADIUS, REACHED, SlideMemory
-from surgsim_apps.training.slide_network import SlideNetwork, declared_lesions, rasterised
+from surgsim_apps.training.slide_network import FORCE, NORMAL, TAXELS, SlideNetwork, declared_lesions, rasterised
 from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, TouchMap, dice, ospa
 
 BATCH, RATE = 24, 4e-3
@@ -64,14 +64,16 @@ class Slide:
     @classmethod
     def of(cls, slices: dict[str, slice], observations: NDArray[np.floating], rows: NDArray[np.float64]) -> "Slide":
         """Slide of observations (n_step, n_observation) and a true map, as an action declares it (LESIONS_MOST, 4)."""
-        memory, parts = SlideMemory(slices, observations[0]), []
-        for number, observation in enumerate(observations):
-            if number:
-                memory.add(observation)
-            parts.append((memory.site, memory.reading, memory.place))
+        memory = SlideMemory(slices, observations[0])
+        site, reading, place = [memory.site], [memory.reading], [memory.place]
+        for observation in observations[1:]:
+            memory.add(observation)
+            site.append(memory.site)
+            reading.append(memory.reading)
+            place.append(memory.place)
         shown = rows[rows[:, 0] > 0.0]
         lesions = np.column_stack([0.5 * (shown[:, 1:3] + 1.0) * memory.map.extent, shown[:, 3] + 1.0])
-        return cls(memory.map, *(np.array(values) for values in zip(*parts, strict=True)), lesions)
+        return cls(memory.map, np.array(site), np.array(reading), np.array(place), lesions)
 
     def raster(self, steps: int, *, remembers: bool) -> NDArray[np.float32]:
         """The network's input after so many control steps."""
@@ -146,13 +148,11 @@ def mirrored(inputs: NDArray[np.float32], labels: NDArray[np.float32], axis: int
     """Example of the mirror image across an axis of the chart: 0 across, 1 along."""
     # The rows of a map are along the chart's second axis.
     inputs, labels = (np.flip(values, axis=2 - axis).copy() for values in (inputs, labels))
-    inputs[[3 + axis, 6 + axis]] *= -1.0
-    count = len(inputs) - 14
-    side = round((count / 3) ** 0.5)
-    taxels = inputs[10 : 10 + count].reshape(side, side, 3, MAP_SIDE, MAP_SIDE)
-    taxels = np.flip(taxels, axis=1 - axis).copy()
+    inputs[[FORCE + axis, NORMAL + axis]] *= -1.0
+    side = round((len(inputs[TAXELS]) / 3) ** 0.5)
+    taxels = np.flip(inputs[TAXELS].reshape(side, side, 3, MAP_SIDE, MAP_SIDE), axis=1 - axis).copy()
     taxels[:, :, axis] *= -1.0
-    inputs[10 : 10 + count] = taxels.reshape(count, MAP_SIDE, MAP_SIDE)
+    inputs[TAXELS] = taxels.reshape(inputs[TAXELS].shape)
     return inputs, labels
 
 
@@ -180,10 +180,10 @@ def train(
     first = torch.cat([next(batches)[0] for _ in range(4)])
     network = SlideNetwork(first.shape[1])
     scale = first.square().mean(dim=(0, 2, 3)).sqrt()
-    network.scale.copy_(torch.where(scale > 0.0, scale, torch.inf))
+    scale[scale == 0.0] = torch.inf
     if without == "taxels":
-        network.scale[10:-4] = torch.inf
-    network.remembers.fill_(float(remembers))
+        scale[TAXELS] = torch.inf
+    network.scale, network.remembers = scale, torch.tensor(float(remembers))
     optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
     for step in range(1, steps + 1):
@@ -194,7 +194,7 @@ def train(
         )
         chances = functional.log_softmax(logits[:, 2].flatten(1), dim=1)
         goal = -(chances * labels[:, 2].flatten(1)).sum(dim=1).mean()
-        loss = sum(weight * part for weight, part in zip(WEIGHTS, (places, areas, goal), strict=True))
+        loss = WEIGHTS[0] * places + WEIGHTS[1] * areas + WEIGHTS[2] * goal
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -21,8 +21,9 @@ from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE
 from surgsim_env.scene import agents_folder
 
 WEIGHTS = agents_folder() / "policies" / "slide_learned.safetensors"
-# Channels beside the mean readings: number of readings, mask of visited sites, of the face, and the tip.
-FURTHER = 4
+# First channels of the force and of the normal, and those of the taxels; the last four are the number of readings, the
+# masks of visited sites and of the face, and the tip.
+FORCE, NORMAL, TAXELS = 3, 6, slice(10, -4)
 # Radius of the tip's spot on the map, and that of a declared lesion's place about a maximum [tip radii].
 SPOT, CENTROID_RADIUS = 1.0, 1.0
 # Least distance between declared lesions [tip radii].
@@ -60,6 +61,8 @@ class SlideNetwork(nn.Module):
     def __init__(self, channels: int, width: int = 24) -> None:
         super().__init__()
         # Root mean square of each channel; infinite for one that is left out.
+        self.scale: torch.Tensor
+        self.remembers: torch.Tensor
         self.register_buffer("scale", torch.ones(channels))
         self.register_buffer("remembers", torch.tensor(1.0))
         self.first = nn.Sequential(nn.Conv2d(channels, width, 1), nn.SiLU(), *_convolutions(width, width, width))

@@ -59,11 +59,11 @@ class SlideMemory:
         """Begin an episode with its first observation."""
         self._slices = slices
         cell, share = (self._read(observation, name) for name in ("map_cell", "chart_share"))
-        face = np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_)
-        self.map = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), face)
-        face &= (np.abs(self.map.places) <= 1.0).all(axis=1)
+        square = TouchMap(share * cell * (MAP_SIDE - 1), float(cell[0]), np.ones(MAP_SIDE * MAP_SIDE, dtype=np.bool_))
+        face = (np.abs(square.places) <= 1.0).all(axis=1)
         if "face_map" in slices:
             face &= self._read(observation, "face_map") > 0.5
+        self.map = TouchMap(square.extent, square.cell, face)
         self.reading = np.zeros(11 + len(self._taxels(observation)))
         self.sums = np.zeros((len(self.reading), MAP_SIDE * MAP_SIDE))
         self.steps = 0

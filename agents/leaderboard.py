@@ -16,7 +16,7 @@ from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.scoring.comparison import compare
 from surgsim_apps.scoring.evaluate import BOOTSTRAP_SEED
 from surgsim_apps.scoring.figures import ScoreEstimate
-from surgsim_apps.scoring.results import SITES, Result, load_results, shipped_results
+from surgsim_apps.scoring.results import SITES, SLIDE, Result, load_results, shipped_results
 from surgsim_apps.scoring.site_search import BOUNDS
 from surgsim_env.scene import PHYSICS_VERSION
 
@@ -37,12 +37,20 @@ PRESSES: tuple[Column, ...] = (
     ("error [mm]", "error_mm", 1, 1.0),
     *LOAD,
 )
+MAPS: tuple[Column, ...] = (
+    ("map score over the time", "map_score", 3, 1.0),
+    ("success [%]", "success", 0, 100.0),
+    ("last error [mm]", "error_mm", 1, 1.0),
+    *LOAD,
+)
 STEPS: tuple[Column, ...] = (("success [%]", "success", 0, 100.0), ("time to success [s]", "seconds", 1, 1.0), *LOAD)
 NOTES = {
     "random": "what the common estimator gives without a search",
     "sites_evolved": "learned acquisition function: 13 numbers in JSON",
     "oracle_near": "presses lesions first, then around them",
     "middle": "blind guess",
+    "slide_random": "declares no lesion",
+    "slide_oracle": "declares each lesion once it is touched",
 }
 
 HEADER = f"""# Leaderboard
@@ -90,7 +98,7 @@ def write_leaderboard(folder: Path, path: Path) -> None:
         parts += [_presses(list(rows)) for _, rows in groupby(group, key=lambda row: row.place)]
     parts.append(SUBMISSION)
     for env_id, rows in groupby((row for row in results if row.env_id != SITES), key=lambda row: row.env_id):
-        parts.append(f"\n## `{env_id}`\n\n{_table(list(rows), STEPS)}\n")
+        parts.append(f"\n## `{env_id}`\n\n{_table(list(rows), MAPS if env_id == SLIDE else STEPS)}\n")
     with output_folder(path.parent) as files:
         (files / path.name).write_text("".join(parts), encoding="utf-8")
 
@@ -102,7 +110,8 @@ def _is_block(result: Result) -> bool:
 def _order(result: Result) -> tuple:
     """Families, then single organs, then blocks; the best first."""
     if result.env_id != SITES:
-        return (True, result.env_id, result.place, -_value(result, "success"))
+        merit = "map_score" if result.env_id == SLIDE else "success"
+        return (True, result.env_id != SLIDE, result.env_id, result.place, -_value(result, merit))
     return (False, _is_block(result), not result.members, result.place, _value(result, AREA))
 
 
@@ -163,7 +172,7 @@ def _title(result: Result) -> str:
 
 
 def _table(rows: Sequence[Result], columns: Sequence[Column]) -> str:
-    scene = columns is STEPS
+    scene = columns is not PRESSES
     head = [*["scene"] * scene, "method", *(column[0] for column in columns), "note"]
     lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:

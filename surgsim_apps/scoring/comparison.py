@@ -8,14 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_apps.scoring.figures import ScoreEstimate, figure_with_interval, median_presses, resamples
-from surgsim_apps.scoring.results import SITES, Result, seeds_text
+from surgsim_apps.scoring.results import SITES, SLIDE, Result, seeds_text
 
 # Heading, digits, factor and unit of each figure.
 SHOWN = {
+    "map_score": ("map score over the time", 3, 1.0, ""),
     "error_of_presses_mm": ("error over all presses", 2, 1.0, " mm"),
     "presses_to_median": ("presses to 5 mm", 1, 1.0, ""),
     "error_mm": ("error after the last", 2, 1.0, " mm"),
     "success": ("success", 0, 100.0, " %"),
+}
+# Figures of each environment, the one by which methods are ranked first.
+COMPARED = {
+    SITES: ("error_of_presses_mm", "presses_to_median", "error_mm", "success"),
+    SLIDE: ("map_score", "error_mm", "success"),
 }
 # Standard errors between a difference and 0 for a power of 80 % at 5 %, two-sided: normal quantiles 1.96 + 0.84.
 POWER = 2.8
@@ -45,7 +51,7 @@ def compare(
 ) -> list[Difference]:
     """Differences of two results by a paired bootstrap (Efron & Tibshirani 1993, ch. 8).
 
-    A draw (`resamples`) takes the same episodes for both. Of environments with control steps it compares `success`.
+    A draw (`resamples`) takes the same episodes for both. It compares the figures of COMPARED, else `success`.
 
     Raises:
         ValueError: results of other seeds, environments or physics, or without single episodes (names both).
@@ -56,7 +62,7 @@ def compare(
     for fault in _faults(first, second):
         raise ValueError(f"{first.method} and {second.method} cannot be compared: {fault}: evaluate both again")
     draws = resamples(len(first.seeds), first.members, rng)
-    names = figures if first.env_id == SITES else ("success",)
+    names = [name for name in COMPARED.get(first.env_id, ("success",)) if name in figures]
     return [(_presses if name == "presses_to_median" else _means)(name, first, second, draws) for name in names]
 
 
@@ -94,7 +100,7 @@ def describe(difference: Difference, first: str, second: str) -> str:
     interval = f"{shown(estimate.value, '+')} ({shown(estimate.low, '+')} to {shown(estimate.high, '+')})"
     values = f"{first} {shown(difference.first)}, {second} {shown(difference.second)}{unit}"
     line = f"{heading}: {values}; difference {interval}{unit}"
-    if difference.figure == "error_of_presses_mm" and math.isfinite(difference.episode_count or 0.0):
+    if difference.figure in ("map_score", "error_of_presses_mm") and math.isfinite(difference.episode_count or 0.0):
         line += f"; {difference.episode_count:.0f} episodes tell them apart (power 80 %, level 5 %)"
     return line
 

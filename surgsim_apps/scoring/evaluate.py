@@ -44,6 +44,7 @@ from surgsim_apps.scoring.figures import EVALUATION_SEEDS, PalpationRecord, epis
 from surgsim_apps.scoring.options import ScoringOptions
 from surgsim_apps.scoring.results import (
     SITES,
+    SLIDE,
     Result,
     load_result,
     seeds_text,
@@ -60,7 +61,7 @@ from surgsim_env.step_progress import StepProgress
 BOOTSTRAP_SEED = 0
 # Default scene and level of an evaluation.
 PLACES = {"scene": "phantom", "level": "standard"}
-SLIDE, SLIDE_PLACES = "SurgSim/Slide-v0", {"scene": "liver_family", "level": "clinical"}
+SLIDE_PLACES = {"scene": "liver_family", "level": "clinical"}
 # Arguments of SurgSim/Palpate-v0 for observations independent of an organ's size and pose.
 IN_FACE = {"memory": True, "frame": "face"}
 # Default split of a family of organs.

@@ -15,7 +15,7 @@ from surgsim_env.scene import STILL, agents_folder
 
 # JSON has no infinity.
 NEVER = "never"
-SITES = "SurgSim/PalpateSites-v0"
+SITES, SLIDE = "SurgSim/PalpateSites-v0", "SurgSim/Slide-v0"
 
 
 @dataclass(frozen=True)

@@ -185,6 +185,8 @@ def random_actions(env_id: str, space: gym.spaces.Box, count: int) -> np.ndarray
     if "Palpate" in env_id:
         shift[:] = PRESS
         scale[3] = 1.0  # declares now and then
+    elif "Slide" in env_id:
+        shift[2] = 0.5  # presses
     else:
         # The jaw nearly closed and towards the free edge.
         scale[1], shift[1], shift[6 if "Bimanual" in env_id else -1] = 0.2, -0.8, -0.5
@@ -360,6 +362,7 @@ def maps() -> Parts:
 
 case("Palpate-v0", play_random, "Palpate-v0", "phantom", 40)
 case("PalpateSites-v0, GP-UCB", play_search, "phantom_small", "gp_ucb", level="standard", budget=16)
+case("Slide-v0", play_random, "Slide-v0", "phantom_small", 40)
 case("Retract-v0", play_random, "Retract-v0", "lobe", 30)
 case("BimanualRetract-v0", play_random, "BimanualRetract-v0", "lobe", 25)
 case("lanes", play_lanes, "Palpate-v0", "phantom_small", 30, memory=True, level="standard", autoreset_mode="SameStep")

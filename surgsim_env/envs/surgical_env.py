@@ -17,7 +17,7 @@ from surgsim_env.envs.saved_state import pack_state, restore_state, state_maker
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
 from surgsim_env.scene.load import fill, require_known
-from surgsim_env.tasks.declaration import ControlStep, documentation, reward_weights
+from surgsim_env.tasks.declaration import ControlStep, documentation
 from surgsim_env.tasks.runtime import make_runtime, setting_names
 from surgsim_env.tasks.task import Task
 
@@ -171,7 +171,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
                 "high: widen them, or correct read"
             )
         self._take(values)
-        info = self._info("", saturated, self.runtime.first_info(), dict.fromkeys(reward_weights(self.task), 0.0))
+        unpaid = {reward.name: 0.0 for reward in self.runtime.rewards}
+        info = self._info("", saturated, self.runtime.first_info(), unpaid)
         # Stiff lesions need added mass, which would tell of them.
         info["added_mass"] = 0.0
         self.halted = ""

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msdm_core.arithmetic import log
+from msdm_core.arithmetic import exp, log, matmul
 from msdm_core.material.regions import Material
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.palpation.bell_fit import BellFit, framed, ratio
@@ -27,6 +27,8 @@ LOG_CONTRAST_BOUND = 2.0
 GRADIENT_GAIN = 0.32
 # Largest absolute part of the gradient, in a tip radius.
 GRADIENT_BOUND = 4.0
+# Largest excess of the stiffest spot in a summary, and least mean contrast under it: a mean near 0 is noise.
+EXCESS_BOUND, MEAN_LEAST = 3.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -273,6 +275,26 @@ class TouchMemory:
         if spot is None:
             spot = self._stiffest = stiffest_spots(self.bell_fit, self.product[None], self.square[None])[0]
         return spot.copy()
+
+    def summary(self, place: FloatArray) -> FloatArray:
+        """Seven numbers for a search from a place of the chart (2,), zeros without a reading but the last two.
+
+        Felt share of the pressable sites, mean contrast c of the felt ones, excess c_max / c - 1 of the stiffest spot;
+        ways [m] along the chart's sides to that spot (2), and to the centroid of the sites that are not felt, weighted
+        by exp(-(d / r)^2 / 2) with their distance d and the tip's radius r (2).
+        """
+        here, reach = 0.5 * (place + 1.0) * self.chart.extent, self.indenter.radius
+        felt, ways = self.square[self.map.pressable] > 0.0, self.map.sites[self.map.pressable] - here
+        near = np.where(felt, 0.0, exp(-0.5 * (ways * ways).sum(axis=1) / (reach * reach)))
+        # Far from all sites the weights are 0.
+        fresh = matmul(near, ways) / max(float(near.sum()), 1e-6)
+        if not felt.any():
+            return np.array([0.0, 0.0, 0.0, 0.0, 0.0, *fresh])
+        u, v, contrast = self.stiffest()
+        mean = float(self.contrast[self.map.pressable][felt].mean())
+        excess = contrast / max(mean, MEAN_LEAST) - 1.0
+        spot = 0.5 * (np.array([u, v]) + 1.0) * self.chart.extent - here
+        return np.array([felt.mean(), mean, min(max(excess, -EXCESS_BOUND), EXCESS_BOUND), *spot, *fresh])
 
 
 def stiffest_spots(bell_fit: BellFit, product: FloatArray, square: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Contents of a scene file as frozen dataclasses, in SI units; comments in the files give sources."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -384,6 +384,19 @@ class Timing:
     def control_step(self) -> float:
         """Duration of a control step [s]."""
         return self.haptic_step * self.haptic_steps_per_control
+
+    def with_control_step(self, duration: float) -> "Timing":
+        """The same with control steps of another duration [s].
+
+        Raises:
+            ValueError: a duration of no whole number of haptic steps.
+        """
+        count = round(duration / self.haptic_step)
+        if count < 1 or abs(count * self.haptic_step - duration) > 1e-6 * duration:
+            raise ValueError(
+                f"control_step is {duration!r} s; it must be a multiple of the haptic step, {self.haptic_step:g} s"
+            )
+        return replace(self, haptic_steps_per_control=count)
 
 
 @dataclass(frozen=True)

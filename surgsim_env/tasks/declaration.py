@@ -318,6 +318,13 @@ COMMON_ARGUMENTS = """* `scaled`: each value over its channel's scale, of order 
   "rgb_force" for a dictionary of it ("picture") and of the channels that depend on force sensing ("force").
 * `looks`: None (default), or "train" or "test" for pictures with a random look in each episode (docs/rendering.md).
 * `measure_tissue`: True measures the tissue's load in each step (`info`) also where the scene has no limits of it.
+* `control_step`: duration of a control step, a multiple of 1 ms [s]; 0.05 by default. With 0.25 an untrained network's
+  commands last long enough to press and to declare.
+* `failure_share`: paid share of the terms of a failure, 0 to 1 (default), for training: at 1 a beginner of palpation
+  learns to do nothing.
+* `shaping`: weight of a term for training, 0 by default, paid per change of the task's potential (a method
+  `potential(step)`, which knows the truth). It is not paid back at the end, so that an episode that ends near its goal
+  pays more; scores leave it out.
 * `render_mode`: None, "rgb_array" (off screen, no display needed) or "human" (a window).
 * `camera`, `width`, `height`, `show_force`, `show_lesion`, `cut_away` and the other fields of
   `surgsim_env.rendering.options.RenderOptions`: what pictures show."""

@@ -2,17 +2,18 @@
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 
-from msdm_core.arithmetic import matmul
+from msdm_core.arithmetic import exp, matmul
 from msdm_core.material.regions import Lesion
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.face_frame import FaceFrame
-from surgsim_env.palpation.touches import Indenter, TouchMemory, felt_lesion_radius
+from surgsim_env.palpation.touches import EXCESS_BOUND, Indenter, TouchMemory, felt_lesion_radius
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import require_known
 from surgsim_env.tasks.channels import (
@@ -28,7 +29,8 @@ from surgsim_env.tasks.declaration import SPEED_FULL_SCALE, Channel, Command, Co
 from surgsim_env.tasks.palpate_sites import CELL_BOUND, WIDE
 from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
-# Control steps of an episode; EPISODE_STEPS_WIDE where the chart's longer side exceeds WIDE tip radii.
+# Control steps of an episode, for steps of 50 ms; EPISODE_STEPS_WIDE where the chart's longer side exceeds WIDE tip
+# radii.
 EPISODE_STEPS, EPISODE_STEPS_WIDE = 600, 1200
 # Axes of commands.
 FRAMES = ("world", "face")
@@ -38,6 +40,8 @@ PLACE_BOUND = 1000.0
 FORCE_SLACK = math.sqrt(3.0) * (1.0 + 1e-6)
 DECLARE_VALUE = 0.8
 DECLARE_STEPS = 3
+# Duration of a control step for which these numbers of steps are stated [s].
+CONTROL_STEP = 0.05
 
 # Height of the tip ball above the surface at the start [m].
 START_GAP = (0.002, 0.006)
@@ -56,8 +60,14 @@ def touch_memory(anatomy: Anatomy) -> TouchMemory:
     )
 
 
-def _site_count(task: "PalpateTask") -> int:
-    return 0 if task.memory is None else MAP_SIDE * MAP_SIDE
+def _with_maps(size: int) -> Callable[["PalpateTask"], int]:
+    """Size of a channel of memory=True."""
+    return lambda task: 0 if task.memory is None or task.summarised else size
+
+
+def _with_summary(size: int) -> Callable[["PalpateTask"], int]:
+    """Size of a channel of memory="summary"."""
+    return lambda task: size if task.summarised else 0
 
 
 def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
@@ -67,7 +77,7 @@ def _stiffest_bound(task: "PalpateTask", instrument: Instrument) -> FloatArray:
 
 def _in_frame(size: int, *, memory: bool = False) -> Callable[["PalpateTask"], int]:
     """Size of a channel of frame="face"; with `memory` of memory=True alone."""
-    return lambda task: size if task.frame is not None and (task.memory is not None or not memory) else 0
+    return lambda task: size if task.frame is not None and (not memory or _with_maps(1)(task)) else 0
 
 
 def _tip_radius(task: "PalpateTask", instrument: Instrument | None) -> float:
@@ -92,10 +102,12 @@ class PalpateTask(Task):
     `Box(-1, 1, (4,), float32)`
 
     ## Observation Space
-    `Box((10,), float32)`, all bounds finite. With `memory=True` `Box((5056,), float32)`: what the sensor felt so far
-    (`surgsim_env.palpation.touches`) on a map of n = 41 x 41 sites, 0.4 tip radii apart, over the middle of the
-    palpable face (`surgsim_env.palpation.chart`), row by row, the same size for every organ; farther apart where 16 tip
-    radii do not span the face. `env.unwrapped.observation_slices` has the entries of each channel by its name.
+    `Box((10,), float32)`, all bounds finite. With `memory="summary"` seven numbers more, enough for a small network:
+    how much of the face was felt, and the ways to the stiffest place and to fresh sites. With `memory=True`
+    `Box((5056,), float32)`: what the sensor felt so far (`surgsim_env.palpation.touches`) on a map of n = 41 x 41
+    sites, 0.4 tip radii apart, over the middle of the palpable face (`surgsim_env.palpation.chart`), row by row, the
+    same size for every organ; farther apart where 16 tip radii do not span the face.
+    `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
     An instrument with taxels has three numbers more for each (`scenes/README.md`).
 
@@ -119,7 +131,7 @@ class PalpateTask(Task):
     along the surface from the point nearest to its centre: 6 mm on `phantom`, 18 mm on `liver`); the contact
     force exceeded the hard limit in a haptic step; the simulation faulted (`info["sim_fault"]` says how, the
     observation is the last finite one). Truncated: 600 control steps (30 s), or 1200 (60 s) where the chart of the face
-    is longer than ten tip radii, as on `liver`.
+    is longer than ten tip radii, as on `liver`; fewer of a longer `control_step`, which last as long.
 
     ## Info
     Fixed keys and types: `sim_fault` (str, "" if none), `sensor_saturated`, `workspace_limited` (by the box, or by an
@@ -142,7 +154,8 @@ class PalpateTask(Task):
     * `motion`: "none", "calm" or "free": how the patient breathes (docs/motion.md); by default as the scene says.
     * `level`: "easy", "standard", "hard" or "clinical" (`surgsim_env.scene.levels`); None, the default: the scene's own
       ranges.
-    * `memory`: whether the observation holds what was felt so far; without it the agent has to remember by itself.
+    * `memory`: False (default): the agent has to remember by itself; True: maps of what was felt so far; "summary": the
+      seven numbers of a search.
     * `frame`: "world" (default), or "face": the velocity command is along the axes of the palpable face, across, along
       and outward, and the observation has the channels of that frame.
     * `episode_steps`: control steps until truncation; by default 600 or 1200, as above.
@@ -162,7 +175,7 @@ class PalpateTask(Task):
             "tip velocity along x, y, z, or along the axes of `frame`",
             axes=lambda task: None if task.frame is None else task.frame.axes,
         ),
-        Command("declare", 1, meaning='above 0.8 for 3 successive control steps, in contact: "the lesion is here"'),
+        Command("declare", 1, meaning='above 0.8 for 0.15 s (3 control steps), in contact: "the lesion is here"'),
     )
     channels = (
         TIP_POSITION,
@@ -170,7 +183,7 @@ class PalpateTask(Task):
         CONTACT_FORCE,
         TIME_LEFT,
         Channel(
-            "contrast", _site_count,
+            "contrast", _with_maps(MAP_SIDE * MAP_SIDE),
             low=lambda task, instrument: -task.memory.bound,
             high=lambda task, instrument: task.memory.bound,
             read=lambda task, simulation: task.memory.contrast,
@@ -178,17 +191,17 @@ class PalpateTask(Task):
             felt=True, size_text="n or 0", bounds_text="+-bound",
         ),
         Channel(
-            "visited", _site_count, "", 0.0, 1.0,
+            "visited", _with_maps(MAP_SIDE * MAP_SIDE), "", 0.0, 1.0,
             read=lambda task, simulation: task.memory.visited,
             meaning="with `memory`: 1 for each site where something was felt", size_text="n or 0",
         ),
         Channel(
-            "face", _site_count, "", 0.0, 1.0,
+            "face", _with_maps(MAP_SIDE * MAP_SIDE), "", 0.0, 1.0,
             read=lambda task, simulation: task.memory.map.pressable,
             meaning="with `memory`: 1 for each site that lies on the palpable face", size_text="n or 0",
         ),
         Channel(
-            "stiffest", lambda task: 0 if task.memory is None else 3,
+            "stiffest", _with_maps(3),
             low=lambda task, instrument: -_stiffest_bound(task, instrument), high=_stiffest_bound,
             read=lambda task, simulation: task.memory.stiffest(),
             meaning="with `memory`: where on the face's chart it is stiffest, by a fit, and the contrast there",
@@ -236,6 +249,41 @@ class PalpateTask(Task):
             meaning='with `frame="face"` and `memory`: lengths of the chart\'s sides over the map\'s',
             size_text="2 or 0",
         ),
+        Channel(
+            "felt_share", _with_summary(1), "", 0.0, 1.0,
+            read=lambda task, simulation: task.searched[:1],
+            meaning='with `memory="summary"`: share of the face\'s sites where something was felt', size_text="1 or 0",
+        ),
+        Channel(
+            "mean_contrast", _with_summary(1),
+            low=lambda task, instrument: -task.memory.bound,
+            high=lambda task, instrument: task.memory.bound,
+            read=lambda task, simulation: task.searched[1:2],
+            meaning='with `memory="summary"`: mean contrast of the felt sites',
+            felt=True, size_text="1 or 0", bounds_text="+-bound",
+        ),
+        Channel(
+            "stiffest_excess", _with_summary(1), "", -EXCESS_BOUND, EXCESS_BOUND,
+            read=lambda task, simulation: task.searched[2:3],
+            meaning='with `memory="summary"`: contrast of the stiffest place over that mean, less 1',
+            felt=True, size_text="1 or 0", scale=0.25,
+        ),
+        Channel(
+            "stiffest_way", _with_summary(2), "m",
+            low=lambda task, instrument: -PLACE_BOUND * _tip_radius(task, instrument),
+            high=lambda task, instrument: PLACE_BOUND * _tip_radius(task, instrument),
+            read=lambda task, simulation: task.searched[3:5],
+            meaning='with `memory="summary"`: from the tip to the stiffest place, along the sides of the face\'s chart',
+            felt=True, size_text="2 or 0", bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
+        ),
+        Channel(
+            "unfelt_way", _with_summary(2), "m",
+            low=lambda task, instrument: -PLACE_BOUND * _tip_radius(task, instrument),
+            high=lambda task, instrument: PLACE_BOUND * _tip_radius(task, instrument),
+            read=lambda task, simulation: task.searched[5:],
+            meaning='with `memory="summary"`: from the tip to the middle of the sites around it that are not felt yet',
+            size_text="2 or 0", bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
+        ),
         TAXELS,
     )  # fmt: skip
     rewards = (
@@ -262,7 +310,7 @@ class PalpateTask(Task):
         self,
         scenario: Scenario,
         *,
-        memory: bool = False,
+        memory: bool | Literal["summary"] = False,
         frame: str = "world",
         episode_steps: int | None = None,
     ) -> None:
@@ -270,12 +318,12 @@ class PalpateTask(Task):
 
         Args:
             scenario: of a scene with the ranges of a lesion.
-            memory: the observation holds the readings so far.
+            memory: the observation holds maps of the readings so far, or their "summary".
             frame: "world", or "face": commands and observations of the tip along the axes of the face.
             episode_steps: control steps of an episode; by default 600, or 1200 on a face longer than ten tip radii.
 
         Raises:
-            ValueError: a scene without a [lesion] table, an unknown frame (names the known), or
+            ValueError: a scene without a [lesion] table, an unknown memory or frame (names the known), or
                 `episode_steps` that is no whole number above 0.
         """
         scene = scenario.anatomy.scene
@@ -284,6 +332,8 @@ class PalpateTask(Task):
                 f"scene {scene.name!r} has no [lesion] table, so that there is nothing to find in it: "
                 "add one, or take a scene that has it, such as 'phantom'"
             )
+        if memory not in (False, True, "summary"):
+            raise ValueError(f'memory is {memory!r}; it must be False, True or "summary"')
         require_known("frame", frame, FRAMES)
         if episode_steps is not None and episode_steps < 1:
             raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
@@ -291,8 +341,13 @@ class PalpateTask(Task):
         self.charted = charted_face(self.anatomy)
         wide = self.charted.chart.extent.max() > WIDE * self.charted.tip_radius
         # The members of a family have the number of their template.
-        self.episode_steps = episode_steps or (EPISODE_STEPS_WIDE if wide else EPISODE_STEPS)
+        share = CONTROL_STEP / scene.timing.control_step
+        self.episode_steps = episode_steps or max(1, round(share * (EPISODE_STEPS_WIDE if wide else EPISODE_STEPS)))
+        self.declare_steps = max(1, round(share * DECLARE_STEPS))
         self.memory = touch_memory(self.anatomy) if memory else None
+        self.summarised = memory == "summary"
+        # `TouchMemory.summary` of the tip's place.
+        self.searched = np.zeros(7)
         self.frame = FaceFrame.of(self.charted) if frame == "face" else None
         # Depth of the ball below the surface at rest [m], and the outward normal there.
         self.tip_depth, self.surface_normal = 0.0, np.zeros(3)
@@ -352,7 +407,23 @@ class PalpateTask(Task):
         depth = self.charted.tip_radius - float(matmul(tip - surface, normal))
         self.tip_depth, self.surface_normal = depth, normal
         if memory is not None:
-            memory.feel(memory.chart.place(surface), depth, float(matmul(self.sensed["contact_force"], normal)))
+            place = memory.chart.place(surface)
+            memory.feel(place, depth, float(matmul(self.sensed["contact_force"], normal)))
+            if self.summarised:
+                self.searched = memory.summary(place)
+
+    def potential(self, step: ControlStep) -> float:
+        """Potential for `shaping`: exp(-d / (1.5 r)) + s / 5, from the truth.
+
+        With the tip's distance d from a press of the scene's depth, three quarters deep, on the surface over the
+        lesion, the tip's radius r, and with memory the felt share s of the face.
+        """
+        assert self.lesion is not None and self.lesion.centre is not None
+        radius, depth = self.charted.tip_radius, self.anatomy.scene.palpation.press_depth
+        over, outward = self.anatomy.face.project(self.lesion.centre)
+        way = self.resting_place(step.simulation) - (over + outward * (radius - 0.75 * depth))
+        felt = 0.0 if self.memory is None else float(self.memory.visited[self.memory.map.pressable].mean())
+        return float(exp(-math.sqrt(float(matmul(way, way))) / (1.5 * radius))) + 0.2 * felt
 
     def end(self, step: ControlStep) -> str:
         """Reason of the end: a fault, the hard limit, or a declaration, "found" or "wrong"."""
@@ -376,7 +447,7 @@ class PalpateTask(Task):
     def _declares(self, simulation: Simulation) -> bool:
         pressing = self._declare_value > DECLARE_VALUE and simulation.contact_centre is not None
         self.declare_count = self.declare_count + 1 if pressing else 0
-        return self.declare_count >= DECLARE_STEPS
+        return self.declare_count >= self.declare_steps
 
     def declared_error(self, simulation: Simulation) -> float:
         """Distance along the resting surface from the touched patch to the point nearest to the lesion's centre [m]."""

@@ -7,7 +7,7 @@ import json
 import math
 import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,13 +56,17 @@ class TaskRuntime:
         layout: of its actions and observations
         family: members that episodes draw from; None for a scene of one organ
         sensors: sensor models, by the channel's name
+        rewards: its terms, as they are paid
         successes, failures: names of the ends that are these
         measures_tissue: True if `info` has the tissue's load, as it has by itself where the scene limits it
     """
 
-    def __init__(self, task: Task, family: OrganFamily | None = None) -> None:
-        """Play the episodes of a task."""
+    def __init__(
+        self, task: Task, family: OrganFamily | None = None, rewards: tuple[Reward, ...] | None = None
+    ) -> None:
+        """Play the episodes of a task, with its rewards or others of these names."""
         self.task, self.family = task, family
+        self.rewards = task.rewards if rewards is None else rewards
         self.measures_tissue = task.limits.judges_tissue
         self.layout = TaskLayout(task)
         own = task.anatomy.scene.sensor
@@ -196,7 +200,7 @@ class TaskRuntime:
         # Adding 0.0 turns a product of -0.0 into 0.0.
         rewards = {
             reward.name: self._finite(reward, reward.weight * self._amount(reward, step, end, before) + 0.0)
-            for reward in task.rewards
+            for reward in self.rewards
         }
         truncated = not end and task.episode_steps is not None and task.step_count >= task.episode_steps
         return Verdict(bool(end), truncated, rewards, self._info(step, load, end))
@@ -214,7 +218,7 @@ class TaskRuntime:
         """Values of the terms paid per change."""
         return {
             reward.name: self._finite(reward, self._value(reward, step))
-            for reward in self.task.rewards
+            for reward in self.rewards
             if reward.per == "change"
         }
 
@@ -328,6 +332,9 @@ def make_runtime(
     motion: str | None = None,
     level: str | None = None,
     split: str | None = None,
+    control_step: float | None = None,
+    shaping: float = 0.0,
+    failure_share: float = 1.0,
     **settings: Any,
 ) -> tuple[Simulation, TaskRuntime]:
     """Simulation and episodes of a task; the arguments that are None are the task's (`Task.setup`).
@@ -341,7 +348,13 @@ def make_runtime(
         level: "easy", "standard", "hard" or "clinical": lesions of the organ (`surgsim_env.scene.levels`).
         split: "train" (default), "validation" or "test": members of a scene's family (`surgsim_env.scene.family`); left
             out for scenes of one organ.
+        control_step: duration of a control step [s]; else the scene's.
+        shaping: weight of a term for training (`training_rewards`).
+        failure_share: paid share of the terms of a failure, likewise.
         settings: keyword-only parameters of the task's `__init__`.
+
+    Raises:
+        ValueError: a control step of no whole number of haptic steps, or what scene and task refuse.
     """
     setup = task_class.setup
     level = level or setup.level
@@ -349,11 +362,37 @@ def make_runtime(
     plain = setup.load(setup.scene if scene is None else scene)
     armed = with_instrument(plain, setup.instrument if instrument is None else instrument)
     described = with_motion(armed, motion or (chosen and chosen.motion))
+    if control_step is not None:
+        described = replace(described, timing=described.timing.with_control_step(control_step))
     anatomy = load_anatomy(described if chosen is None else chosen.scene(described))
     family = family_of(anatomy, split)
     simulation = Simulation(anatomy)
     task = task_class(Scenario(anatomy, simulation.instrument, chosen, family, plain), **settings)
-    return simulation, TaskRuntime(task, family)
+    return simulation, TaskRuntime(task, family, training_rewards(task, shaping, failure_share))
+
+
+def training_rewards(task: Task, shaping: float, failure_share: float) -> tuple[Reward, ...]:
+    """The reward terms of a task, changed for training.
+
+    Args:
+        task: the task; with `shaping` one with a method `potential(step)`, a number for a `ControlStep`.
+        shaping: weight of a further term "shaping", paid per change of the potential; 0 for none.
+        failure_share: paid share of the terms of a failure, 0 to 1.
+
+    Raises:
+        ValueError: shaping of a task without a potential, or a share beyond 0 to 1.
+    """
+    if not 0.0 <= failure_share <= 1.0:
+        raise ValueError(f"failure_share is {failure_share!r}; it must be a number from 0 to 1")
+    terms = tuple(
+        replace(term, weight=failure_share * term.weight) if term.per in ("failure", "step left") else term
+        for term in task.rewards
+    )
+    if not shaping:
+        return terms
+    if not hasattr(task, "potential"):
+        raise ValueError(f"shaping is {shaping!r}, and {type(task).__name__} has no method potential(step): define it")
+    return (*terms, Reward("shaping", shaping, "change", value=lambda task, step: task.potential(step)))
 
 
 def setting_names(task_class: type[Task]) -> set[str]:

@@ -21,8 +21,8 @@ from surgsim_env.tasks.declaration import Channel, Command, ControlStep, Reward,
 from surgsim_env.tasks.palpate_sites import CELL_BOUND, SUCCESS_ERROR
 from surgsim_env.tasks.task import InfoValue, Scenario, Task
 
-# Control steps of an episode: 20 s.
-EPISODE_STEPS = 400
+# Duration of an episode [s].
+EPISODE_TIME = 20.0
 # Full scale of the speed along the surface [tip radii / s].
 SLIDE_SPEED = 4.0
 # Distance ahead of the tip at which the way must be pressable, at full speed [tip radii].
@@ -89,7 +89,7 @@ class SlideTask(Task):
     registration [m] along each side of the chart; the tip is above a random pressable place, at rest.
 
     ## Episode End
-    Terminated: after 400 control steps (20 s; success if OSPA of the last map is at most 5 mm for a tip of 8 mm radius,
+    Terminated: after 20 s (400 control steps; success if OSPA of the last map is at most 5 mm for a tip of 8 mm radius,
     in proportion for others); the contact force exceeded the hard limit; tissue was damaged; the simulation faulted.
 
     ## Info
@@ -107,7 +107,7 @@ class SlideTask(Task):
     * `level`: "easy", "standard", "hard" or "clinical" (default).
     * `motion`: "none", "calm" or "free"; by default as the level says: "calm" for "clinical".
     * `face`: observe the map of the pressable sites, the same in every step of an episode; default False.
-    * `episode_steps`: control steps of an episode; default 400.
+    * `episode_steps`: control steps of an episode; by default those of 20 s.
     * `split`: "train" (default), "validation" or "test": members of a family of organs, of which each episode draws
       one; `info["member"]` names it.
 
@@ -214,7 +214,8 @@ class SlideTask(Task):
             ValueError: `episode_steps` that is no whole number above 0.
         """
         super().__init__(scenario)
-        self.episode_steps = EPISODE_STEPS if episode_steps is None else episode_steps
+        own_steps = round(EPISODE_TIME / self.anatomy.scene.timing.control_step)
+        self.episode_steps = own_steps if episode_steps is None else episode_steps
         if self.episode_steps < 1:
             raise ValueError(f"episode_steps is {episode_steps!r}; it must be a whole number of steps, at least 1")
         self.shows_face = face

@@ -91,6 +91,9 @@ VALUES = {
     "motion": "calm",
     "level": "hard",
     "split": None,
+    "control_step": np.float64(0.1),
+    "shaping": np.float64(10.0),
+    "failure_share": 0.5,
     "memory": np.True_,
     "frame": "face",
     "face": True,
@@ -106,17 +109,21 @@ VALUES = {
 }
 OTHERS = {
     "SurgSim/Palpate-v0": {"scene": scenes_folder() / "organs" / "kidney_family.toml", "split": "test"},
+    # Without a potential.
+    "SurgSim/PalpateSites-v0": {"shaping": 0.0},
     "SurgSim/Retract-v0": {
+        "shaping": 0.0,
         "scene": scenes_folder() / "organs" / "lobe.toml",
         "instrument": scenes_folder() / "instruments" / "psm_retractor.toml",
         "level": None,
     },
     "SurgSim/BimanualRetract-v0": {
+        "shaping": 0.0,
         "scene": scenes_folder() / "organs" / "lobe.toml",
         "instrument": "psm_pair",
         "level": None,
     },
-    OWN: {"level": None},
+    OWN: {"level": None, "shaping": 0.0},
 }
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from surgsim_env.palpation.scores import dice
 from surgsim_env.tasks.declaration import reward_weights
-from surgsim_env.tasks.slide import EPISODE_STEPS, SlideTask
+from surgsim_env.tasks.slide import SlideTask
 
 BLOCK = {"scene": "phantom_small", "level": "easy", "episode_steps": 40}
 
@@ -133,10 +133,10 @@ def test_a_scene_without_a_dose_limit_gets_the_tasks(made):
 
 
 def test_no_failure_pays_more_than_going_on():
-    """What is left pays at least the cost of force; the step of the failure pays its map."""
+    """What is left pays at least the cost of force; the step of the failure, here one of 10, pays its map."""
     weights = reward_weights(SlideTask)
     for failure in ("hard_force", "fault"):
-        assert weights[failure] + weights["map"] / EPISODE_STEPS < weights["soft_force"]
+        assert weights[failure] + weights["map"] / 10 < weights["soft_force"]
 
 
 @pytest.mark.parametrize("steps", [0, -3])

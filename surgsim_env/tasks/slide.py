@@ -38,8 +38,9 @@ LESION_NUMBERS = ("presence", "across", "along", "radius")
 PLACE_BOUND, LENGTH_BOUND, THICKNESS_BOUND = 100.0, 1000.0, 20.0
 # Gap of the tip above the surface at the start [m].
 START_GAP = 0.003
-# Largest dose of the tissue where the scene states none [Pa s]: some ten times that of a sweep over the face.
-DOSE = math.inf
+# Largest dose of the tissue where the scene states none [Pa s]: chosen, some ten times that of a sweep over a face of
+# `liver_family`.
+DOSE = 5e4
 
 
 def _tip_radius(task: "SlideTask", instrument: Instrument | None) -> float:

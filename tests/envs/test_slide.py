@@ -8,7 +8,7 @@ import pytest
 
 from surgsim_env.palpation.scores import dice
 from surgsim_env.tasks.declaration import reward_weights
-from surgsim_env.tasks.slide import SlideTask
+from surgsim_env.tasks.slide import DOSE, SlideTask
 
 BLOCK = {"scene": "phantom_small", "level": "easy", "episode_steps": 40}
 
@@ -129,7 +129,8 @@ def test_dice_of_masks():
 
 
 def test_a_scene_without_a_dose_limit_gets_the_tasks(made):
-    assert made.unwrapped.task.limits.dose is not None
+    assert made.unwrapped.task.limits.dose == DOSE
+    assert made.step(action())[-1]["tissue_dose"] == 0.0  # the tip is still above the surface
 
 
 def test_no_failure_pays_more_than_going_on():

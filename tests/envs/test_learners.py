@@ -111,6 +111,7 @@ OTHERS = {
     "SurgSim/Palpate-v0": {"scene": scenes_folder() / "organs" / "kidney_family.toml", "split": "test"},
     # Without a potential.
     "SurgSim/PalpateSites-v0": {"shaping": 0.0},
+    "SurgSim/Slide-v0": {"shaping": 0.0},
     "SurgSim/Retract-v0": {
         "shaping": 0.0,
         "scene": scenes_folder() / "organs" / "lobe.toml",

@@ -96,11 +96,12 @@ class SlideTask(Task):
     ## Info
     Fixed keys and types: `sim_fault` (str), `sensor_saturated`, `workspace_limited`, `hard_limit`, `success`,
     `is_success` (bool), `force_peak` [N], `cost` (force above the soft limit, 1 at the hard one), `error_mm` (OSPA of
-    the declared map; -1 after a reset), `dice`, `map_score` (mean score so far; 0 after a reset), `path_length` [m] in
-    contact, `trocar_error_mm`, `added_mass` [kg], one `reward_<term>` each. `member` (str) where the scene is a family;
-    `tissue_pressure` [Pa], `tissue_strain` and more as for `SurgSim/PalpateSites-v0`. In the last step the true map,
-    as `lesions` of the action would declare it: `lesion_1_presence`, `lesion_1_across`, `lesion_1_along`,
-    `lesion_1_radius` and so on, before that and for lesions that are not there -1.
+    the declared map; -1 after a reset), `dice`, `map_score` (sum of the scores so far over the number of control steps of
+    an episode: what follows a failure counts 0), `path_length` [m] in contact, `trocar_error_mm`, `added_mass` [kg], one
+    `reward_<term>` each. `member` (str) where the scene is a family; `tissue_pressure` [Pa], `tissue_strain` and more
+    as for `SurgSim/PalpateSites-v0`. In the last step the true map, as `lesions` of the action would declare it:
+    `lesion_1_presence`, `lesion_1_across`, `lesion_1_along`, `lesion_1_radius` and so on, before that and for lesions
+    that are not there -1.
 
     ## Arguments
     * `scene`: a scene's name or the path of a scene file with a `[lesion]` table; default "liver_family".
@@ -268,7 +269,7 @@ class SlideTask(Task):
         way *= 0.0 if length == 0.0 else min(speed / length, 1.0 / duration)
         normal, outward = self.surface_normal, -self.charted.face.approach
         along = way[0] * chart.across + way[1] * chart.along
-        # Along the surface, with the same way on the chart.
+        # Along the surface, with the same way on the chart, unless that is steeper than any face.
         along -= outward * float(matmul(along, normal)) / max(float(matmul(outward, normal)), 0.1)
         inward = self._inward_speed(float(commands["press"][0]), duration)
         instrument.command_velocity(along - min(max(inward, -NORMAL_SPEED * radius), NORMAL_SPEED * radius) * normal)
@@ -333,7 +334,7 @@ class SlideTask(Task):
             **super().info(step, end),
             "error_mm": -1.0 if step is None else self.error * 1000.0,
             "dice": self.dice,
-            "map_score": self.score_sum / max(self.step_count, 1),
+            "map_score": self.score_sum / (self.episode_steps or 1),
             "path_length": self.path_length,
             **self._true_map(shown=bool(end)),
         }

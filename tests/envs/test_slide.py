@@ -83,14 +83,14 @@ def test_the_true_map_has_the_full_score_and_pays_it_in_each_step(made):
     _, reward, *_, info = made.step(action(lesions=true_rows(task)))
     # A radius of the action, and the surface between the sites of its table, are rounded.
     assert info["dice"] == pytest.approx(1.0, abs=0.03) and info["error_mm"] < 0.5
-    assert info["map_score"] == pytest.approx(task.score) == pytest.approx(1.0, abs=0.05)
-    assert reward == pytest.approx(task.score / 40)
+    assert task.score == pytest.approx(1.0, abs=0.05)
+    assert info["map_score"] == pytest.approx(task.score / 40) == pytest.approx(reward)
 
 
 def test_a_false_map_scores_less_than_an_empty_one_of_an_organ_without_lesions(made):
     task = made.unwrapped.task
     task.lesions, task.drawn = (), type(task.drawn)(())
-    assert made.step(action())[-1]["map_score"] == 1.0
+    assert made.step(action())[-1]["map_score"] == 1.0 / 40
     _, _, _, _, info = made.step(action(lesions=[(1.0, 0.0, 0.0, 0.0)]))
     assert info["dice"] == 0.0 and info["error_mm"] == pytest.approx(1000.0 * task.cutoff)
 

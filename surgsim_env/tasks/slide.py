@@ -96,10 +96,10 @@ class SlideTask(Task):
     ## Info
     Fixed keys and types: `sim_fault` (str), `sensor_saturated`, `workspace_limited`, `hard_limit`, `success`,
     `is_success` (bool), `force_peak` [N], `cost` (force above the soft limit, 1 at the hard one), `error_mm` (OSPA of
-    the declared map; -1 after a reset), `dice`, `map_score` (sum of the scores so far over the number of control steps of
-    an episode: what follows a failure counts 0), `path_length` [m] in contact, `trocar_error_mm`, `added_mass` [kg], one
-    `reward_<term>` each. `member` (str) where the scene is a family; `tissue_pressure` [Pa], `tissue_strain` and more
-    as for `SurgSim/PalpateSites-v0`. In the last step the true map, as `lesions` of the action would declare it:
+    the declared map; -1 after a reset), `dice`, `map_score` (sum of the scores so far over the number of control steps
+    of an episode: what follows a failure counts 0), `path_length` [m] in contact, `trocar_error_mm`, `added_mass` [kg],
+    one `reward_<term>` each. `member` (str) where the scene is a family; `tissue_pressure` [Pa], `tissue_strain` and
+    more as for `SurgSim/PalpateSites-v0`. In the last step the true map, as `lesions` of the action would declare it:
     `lesion_1_presence`, `lesion_1_across`, `lesion_1_along`, `lesion_1_radius` and so on, before that and for lesions
     that are not there -1.
 

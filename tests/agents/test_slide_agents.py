@@ -94,6 +94,32 @@ def test_the_oracle_declares_each_lesion_when_it_touches_it():
     assert score > 0.5
 
 
+def test_a_blind_guess_and_an_empty_map_score_less_than_a_sweep():
+    """Eight blocks at level standard, half an episode; a map without touch has the same score in each step."""
+    lanes = {"vectorization_mode": "vector_entry_point", "dtype": "float32", "autoreset_mode": "Disabled"}
+    envs: Any = gym.make_vec(SLIDE, num_envs=8, scene="phantom", level="standard", face=True, **lanes)
+    steps = 200
+
+    def score(actions):
+        """Mean score over `steps` control steps."""
+        observations, infos = envs.reset(seed=100)
+        for _ in range(steps):
+            observations, _, _, _, infos = envs.step(actions(observations))
+        return infos["map_score"].mean() * envs.unwrapped.envs[0].task.episode_steps / steps
+
+    agents = [SLIDES["slide_sweep"]() for _ in range(8)]
+    for agent in agents:
+        agent.reset(np.random.default_rng(0), episode_facts(envs.unwrapped.envs[0], SLIDE, {}))
+    sweep_score = score(lambda seen: np.stack([agent.act(row) for agent, row in zip(agents, seen, strict=True)]))
+    still = np.full((8, 15), -1.0, dtype=np.float32)
+    still[:, :2] = 0.0
+    for middle in (still[:, 3:7], np.tile(np.array([1.0, 0.0, 0.0, 0.1], dtype=np.float32), (8, 1))):
+        still[:, 3:7] = middle
+        envs.reset(seed=100)
+        blind = envs.step(still)[-1]["map_score"].mean() * envs.unwrapped.envs[0].task.episode_steps
+        assert sweep_score > blind + 0.15
+
+
 def test_lesions_as_numbers_of_an_action():
     rows = lesion_numbers(np.array([[3.0, 2.0]]), np.array([1.5]), np.array([12.0, 8.0])).reshape(3, 4)
     assert rows[0] == pytest.approx([1.0, -0.5, -0.5, 0.5])

@@ -13,7 +13,7 @@ from msdm_core.kernels.ray_kernels import nearest_hits
 from msdm_core.material.regions import Material
 from msdm_core.mesh.geodesic import NearestTriangle
 from msdm_core.mesh.surface import node_normals
-from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, protect_arrays
+from msdm_core.mesh.tet_mesh import FloatArray, IntArray, TetMesh, protect_arrays, read_only
 from surgsim_env.scene.model import PalpationSettings
 
 # Rounding error of heights of the face [m].
@@ -101,7 +101,7 @@ class PalpableFace:
         """Twice the cumulative area of the triangles [m^2], shape (n_face,)."""
         corners = self.points[self.triangles]
         area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        return np.cumsum(area)
+        return read_only(np.cumsum(area))
 
     def random_point(self, rng: np.random.Generator, rim_distance: float) -> tuple[FloatArray, FloatArray]:
         """Draw a point and its normal, uniformly over the open, thick face at least `rim_distance` [m] from its border.

@@ -8,6 +8,7 @@ import math
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -56,17 +57,18 @@ class TaskRuntime:
         layout: of its actions and observations
         family: members that episodes draw from; None for a scene of one organ
         sensors: sensor models, by the channel's name
-        rewards: its terms, as they are paid
         successes, failures: names of the ends that are these
         measures_tissue: True if `info` has the tissue's load, as it has by itself where the scene limits it
     """
 
     def __init__(
-        self, task: Task, family: OrganFamily | None = None, rewards: tuple[Reward, ...] | None = None
+        self, task: Task, family: OrganFamily | None = None, *, shaping: float = 0.0, failure_share: float = 1.0
     ) -> None:
-        """Play the episodes of a task, with its rewards or others of these names."""
+        """Play the episodes of a task, with its rewards or those for training (`training_rewards`)."""
         self.task, self.family = task, family
-        self.rewards = task.rewards if rewards is None else rewards
+        # Terms hold functions, which cannot be pickled: an environment is, with these numbers.
+        self._training = float(shaping), float(failure_share)
+        training_rewards(type(task), *self._training)
         self.measures_tissue = task.limits.judges_tissue
         self.layout = TaskLayout(task)
         own = task.anatomy.scene.sensor
@@ -91,6 +93,12 @@ class TaskRuntime:
         self.successes = ("success", *(reward.name for reward in task.rewards if reward.per == "success"))
         # Last values of the terms paid per change.
         self._reached: dict[str, float] = {}
+
+    @property
+    def rewards(self) -> tuple[Reward, ...]:
+        """The task's terms, as they are paid."""
+        unchanged = self._training == (0.0, 1.0)
+        return self.task.rewards if unchanged else training_rewards(type(self.task), *self._training)
 
     # ---- limits of a control step ------------------------------------------------------------------------------
 
@@ -368,14 +376,15 @@ def make_runtime(
     family = family_of(anatomy, split)
     simulation = Simulation(anatomy)
     task = task_class(Scenario(anatomy, simulation.instrument, chosen, family, plain), **settings)
-    return simulation, TaskRuntime(task, family, training_rewards(task, shaping, failure_share))
+    return simulation, TaskRuntime(task, family, shaping=shaping, failure_share=failure_share)
 
 
-def training_rewards(task: Task, shaping: float, failure_share: float) -> tuple[Reward, ...]:
+@cache
+def training_rewards(task: type[Task], shaping: float, failure_share: float) -> tuple[Reward, ...]:
     """The reward terms of a task, changed for training.
 
     Args:
-        task: the task; with `shaping` one with a method `potential(step)`, a number for a `ControlStep`.
+        task: its class; with `shaping` one with a method `potential(step)`, a number for a `ControlStep`.
         shaping: weight of a further term "shaping", paid per change of the potential; 0 for none.
         failure_share: paid share of the terms of a failure, 0 to 1.
 
@@ -391,7 +400,7 @@ def training_rewards(task: Task, shaping: float, failure_share: float) -> tuple[
     if not shaping:
         return terms
     if not hasattr(task, "potential"):
-        raise ValueError(f"shaping is {shaping!r}, and {type(task).__name__} has no method potential(step): define it")
+        raise ValueError(f"shaping is {shaping!r}, and {task.__name__} has no method potential(step): define it")
     return (*terms, Reward("shaping", shaping, "change", value=lambda task, step: task.potential(step)))
 
 

@@ -27,8 +27,8 @@ def test_the_expert_succeeds_and_side_by_side_it_is_scored_as_alone():
     from surgsim_apps.scoring.expert_retract import RetractExpert
 
     seeds = [21, 22, 23]
-    records = play_tasks(RetractExpert().act_all, envs(2), seeds)
-    single = gym.make(ID, measure_tissue=True)
+    records = play_tasks(RetractExpert().act_all, envs(2, scaled=False), seeds)
+    single = gym.make(ID, measure_tissue=True, scaled=False)
     for seed, record in zip(seeds, records, strict=True):
         observation, info = single.reset(seed=seed)
         steps, total, loads, over = 0, 0.0, [], False

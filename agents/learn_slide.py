@@ -27,7 +27,7 @@ from surgsim_apps.cli.main import exit_status
 from surgsim_apps.reports.output_folder import output_folder
 from surgsim_apps.training.slide_agents import LESION_RADIUS, REACHED, SlideMemory
 from surgsim_apps.training.slide_network import FORCE, NORMAL, TAXELS, SlideNetwork, declared_lesions, rasterised
-from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, TouchMap, dice, ospa
+from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, TouchMap, map_errors, map_score, ospa_cutoff
 
 BATCH, RATE = 24, 4e-3
 # Spread of a lesion's spot among the labels [tip radii].
@@ -40,7 +40,6 @@ STEPS_LEAST = 20
 MOMENTS = (0.15, 0.3, 0.5, 0.7, 1.0)
 # Thresholds of a declared lesion among which the check chooses.
 LEAST = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
-CUTOFF = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +119,11 @@ def true_map(infos: dict[str, Any]) -> NDArray[np.float64]:
     )
 
 
-def map_score(slide: Slide, points: NDArray[np.float64]) -> float:
-    """Score of declared places [tip radii] (k, 2) of LESION_RADIUS, as of the environment, with OSPA on the chart."""
-    masks = [
-        (np.linalg.norm(slide.map.sites[:, None] - places, axis=2) <= radii).any(axis=1)
-        for places, radii in ((slide.lesions[:, :2], slide.lesions[:, 2]), (points, LESION_RADIUS))
-    ]
-    return 0.5 * (1.0 - ospa(slide.lesions[:, :2], points, CUTOFF) / CUTOFF + dice(*masks))
+def score_of(slide: Slide, points: NDArray[np.float64]) -> float:
+    """The environment's score of declared places [tip radii] (k, 2) of LESION_RADIUS."""
+    declared = np.column_stack([points, np.full(len(points), LESION_RADIUS)])
+    cutoff = ospa_cutoff(1.0)
+    return map_score(*map_errors(slide.map.sites, slide.lesions, declared, cutoff), cutoff)
 
 
 def check(network: SlideNetwork, slides: Sequence[Slide]) -> dict[float, list[float]]:
@@ -140,7 +137,7 @@ def check(network: SlideNetwork, slides: Sequence[Slide]) -> dict[float, list[fl
                 heats.append(torch.sigmoid(network(torch.as_tensor(inputs)[None])[0, 0]).numpy().ravel())
         for least, values in scores.items():
             found = [declared_lesions(heat, slide.map.sites, least) for heat, slide in zip(heats, slides, strict=True)]
-            values.append(float(np.mean([map_score(*pair) for pair in zip(slides, found, strict=True)])))
+            values.append(float(np.mean([score_of(*pair) for pair in zip(slides, found, strict=True)])))
     return scores
 
 

@@ -56,12 +56,13 @@ from surgsim_apps.training.site_agent import site_facts
 from surgsim_apps.training.slide_agents import SLIDES
 from surgsim_env.scene import PHYSICS_VERSION, agents_folder, list_scenes, make_scene
 from surgsim_env.step_progress import StepProgress
+from surgsim_env.tasks import SlideTask
 
 # Seed of the bootstrap.
 BOOTSTRAP_SEED = 0
 # Default scene and level of an evaluation.
 PLACES = {"scene": "phantom", "level": "standard"}
-SLIDE_PLACES = {"scene": "liver_family", "level": "clinical"}
+SLIDE_PLACES = {"scene": SlideTask.setup.scene, "level": str(SlideTask.setup.level)}
 # Arguments of SurgSim/Palpate-v0 for observations independent of an organ's size and pose.
 IN_FACE = {"memory": True, "frame": "face"}
 # Default split of a family of organs.

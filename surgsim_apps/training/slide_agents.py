@@ -10,10 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from msdm_core.mesh import FloatArray
 from surgsim_env.palpation import LESIONS_MOST, MAP_SIDE, LesionEstimate, LesionEstimator, TouchMap
 from surgsim_env.tasks import SlideTask
-
-FloatArray = NDArray[np.float64]
 
 # Numbers of a declared lesion: presence, place (2), radius.
 LESION_NUMBERS = 4

@@ -12,7 +12,15 @@ from surgsim_env.palpation.lesion_estimator import (
     strongest_apart,
 )
 from surgsim_env.palpation.member_chart import member_map, still_template
-from surgsim_env.palpation.scores import CUTOFF, FOUND_SHARE, dice, matched_distances, ospa, ospa_cutoff
+from surgsim_env.palpation.scores import (
+    CUTOFF,
+    FOUND_SHARE,
+    map_errors,
+    map_score,
+    matched_distances,
+    ospa,
+    ospa_cutoff,
+)
 from surgsim_env.palpation.site_press import (
     HOLD_TIME,
     PRESS_SPEED,
@@ -43,9 +51,10 @@ __all__ = [
     "SitePress",
     "TouchMap",
     "contrast_process",
-    "dice",
     "healthy_file",
     "interpolated",
+    "map_errors",
+    "map_score",
     "matched_distances",
     "member_map",
     "ospa",

@@ -41,6 +41,28 @@ def dice(truth: NDArray[np.bool_], estimate: NDArray[np.bool_]) -> float:
     return 2.0 * float((truth & estimate).sum()) / total if total else 1.0
 
 
+def map_errors(sites: FloatArray, truth: FloatArray, declared: FloatArray, cutoff: float) -> tuple[float, float]:
+    """OSPA of the places [m] and Dice of the discs of declared lesions.
+
+    Args:
+        sites: points whose number in a disc measures its area [m], shape (n, 2).
+        truth: places and radii of the lesions [m], shape (m, 3).
+        declared: those of the declared ones [m], shape (k, 3).
+        cutoff: of OSPA [m].
+    """
+    squared = [np.square(sites[:, None] - lesions[:, :2]).sum(axis=2) for lesions in (truth, declared)]
+    hidden, drawn = (
+        (away <= lesions[:, 2] * lesions[:, 2]).any(axis=1)
+        for away, lesions in zip(squared, (truth, declared), strict=True)
+    )
+    return ospa(truth[:, :2], declared[:, :2], cutoff), dice(hidden, drawn)
+
+
+def map_score(error: float, overlap: float, cutoff: float) -> float:
+    """Score of a declared map, (1 - OSPA / cutoff + Dice) / 2, from 0 to 1."""
+    return 0.5 * (1.0 - error / cutoff + overlap)
+
+
 def matched_distances(
     truth: FloatArray, estimate: FloatArray, cutoff: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:

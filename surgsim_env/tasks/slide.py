@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from msdm_core.arithmetic import matmul, norm
 from msdm_core.mesh.tet_mesh import FloatArray
@@ -12,7 +11,7 @@ from surgsim_env.instruments.instrument import Instrument
 from surgsim_env.palpation.chart import MAP_SIDE, charted_face
 from surgsim_env.palpation.face_frame import FaceFrame
 from surgsim_env.palpation.lesion_estimator import LESIONS_MOST
-from surgsim_env.palpation.scores import dice, ospa, ospa_cutoff
+from surgsim_env.palpation.scores import map_errors, map_score, ospa_cutoff
 from surgsim_env.scene.levels import REFERENCE_TIP
 from surgsim_env.scene.load import make_scene
 from surgsim_env.scene.model import Scene
@@ -311,13 +310,14 @@ class SlideTask(Task):
 
     def _judge_map(self) -> None:
         """OSPA, Dice and score of the declared map."""
-        chart, radius, truth = self.charted.chart, self.charted.tip_radius, self.true_map
+        chart, truth = self.charted.chart, self.true_map
         shown = self.declared[self.declared[:, 0] > 0.0]
-        true_places, places = chart.plane_point(truth[:, :2]), chart.plane_point(shown[:, 1:3])
-        self.error = ospa(true_places, places, self.cutoff)
+        radii = self.charted.tip_radius * (1.0 + shown[:, 3])
+        truth = np.column_stack([chart.plane_point(truth[:, :2]), truth[:, 2]])
+        declared = np.column_stack([chart.plane_point(shown[:, 1:3]), radii])
         sites = chart.lower + self.charted.touch_map.sites
-        self.dice = dice(_discs(sites, true_places, truth[:, 2]), _discs(sites, places, radius * (1.0 + shown[:, 3])))
-        self.score = 0.5 * (1.0 - self.error / self.cutoff + self.dice)
+        self.error, self.dice = map_errors(sites, truth, declared, self.cutoff)
+        self.score = map_score(self.error, self.dice, self.cutoff)
 
     # ---- judgement --------------------------------------------------------------------------------------------------
 
@@ -350,9 +350,3 @@ class SlideTask(Task):
             for number, row in enumerate(rows.tolist(), start=1)
             for name, value in zip(LESION_NUMBERS, row, strict=True)
         }
-
-
-def _discs(sites: FloatArray, centres: FloatArray, radii: FloatArray) -> NDArray[np.bool_]:
-    """Mask of sites [m] (n, 2) in any disc of given centres [m] (k, 2) and radii [m] (k,)."""
-    squared = np.square(sites[:, None] - centres).sum(axis=2)
-    return (squared <= radii * radii).any(axis=1)

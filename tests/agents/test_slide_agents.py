@@ -178,7 +178,7 @@ def test_the_labels_are_the_true_map_and_the_oracles_way(recorded, learn):
     touched = np.linalg.norm(slide.place - centre, axis=1).min() < learn.REACHED
     assert slide.labels(60)[2].sum() == pytest.approx(0.0 if touched else 1.0)
     # Its radius is the one that scripts declare, not its own.
-    assert learn.map_score(slide, slide.lesions[:, :2]) > 0.6 > learn.map_score(slide, np.zeros((0, 2)))
+    assert learn.score_of(slide, slide.lesions[:, :2]) > 0.6 > learn.score_of(slide, np.zeros((0, 2)))
 
 
 @pytest.mark.agents
@@ -209,7 +209,7 @@ def test_a_network_fits_a_slide_and_plays_from_its_file(recorded, learn, tmp_pat
     network = learn.train([slide], [slide], steps=40, seed=0, without=without)
     scores = {least: np.mean(values) for least, values in learn.check(network, [slide]).items()}
     if without != "memory":
-        assert max(scores.values()) > learn.map_score(slide, np.zeros((0, 2)))
+        assert max(scores.values()) > learn.score_of(slide, np.zeros((0, 2)))
     path = tmp_path / "slide.safetensors"
     path.write_bytes(safetensors.torch.save(network.state_dict()))
     assert bool(load_network(path).remembers) is (without != "memory")

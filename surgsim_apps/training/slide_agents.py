@@ -187,16 +187,6 @@ class Way:
 # ---- agents ----------------------------------------------------------------------------------------------------------
 
 
-def lesion_rows(places: FloatArray, radii: FloatArray, extent: FloatArray) -> FloatArray:
-    """The declaration of up to three lesions at places (k, 2) with radii (k,), all in tip radii, as an action (12,)."""
-    rows = np.full((3, 4), -1.0)
-    count = min(len(places), len(rows))
-    rows[:count, 0] = 1.0
-    rows[:count, 1:3] = np.clip(2.0 * places[:count] / extent - 1.0, -1.0, 1.0)
-    rows[:count, 3] = np.clip(radii[:count] - 1.0, -1.0, 1.0)
-    return rows.ravel()
-
-
 class SlideSweep:
     """Slides along a boustrophedon with one set point of the force, and maps by a Gaussian process.
 

@@ -38,7 +38,6 @@ from surgsim_apps.scoring.episodes import (
     site_success,
     task_columns,
 )
-from surgsim_apps.scoring.expert_palpate import PalpateExpert
 from surgsim_apps.scoring.expert_retract import RetractExpert
 from surgsim_apps.scoring.figures import EVALUATION_SEEDS, PalpationRecord, episode_columns, press_errors, score
 from surgsim_apps.scoring.options import ScoringOptions
@@ -131,11 +130,6 @@ def _organ_expert(*, blind: bool) -> Actor:
 
 TASK_AGENTS = {
     "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, {"scaled": False}),
-    "expert_palpate": TaskAgent(
-        "SurgSim/Palpate-v0",
-        lambda kwargs: PalpateExpert(gym.make("SurgSim/Palpate-v0", **kwargs)).act,
-        {"memory": True},
-    ),
     "expert_organs": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=False), IN_FACE),
     **{name: _slide(make) for name, make in SLIDES.items()},
     "blind_middle": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=True), IN_FACE),

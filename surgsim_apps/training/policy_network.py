@@ -12,13 +12,11 @@ from torch import nn
 
 from surgsim_apps.training.face_features import FaceSummary
 from surgsim_apps.training.picture_features import PictureAndForce
-from surgsim_apps.training.touch_features import TouchSummary
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 FEATURES: dict[str, type[nn.Module]] = {
     "FaceSummary": FaceSummary,
     "PictureAndForce": PictureAndForce,
-    "TouchSummary": TouchSummary,
 }
 # Defaults of stable-baselines3's VecNormalize: epsilon of variances and clip of observations.
 VARIANCE_SLACK = 1e-8

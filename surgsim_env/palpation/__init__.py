@@ -1,6 +1,6 @@
 """Palpation: presses, charts of faces, contrast maps, lesion estimators, errors."""
 
-from surgsim_env.palpation.chart import MAP_CELL, MAP_SIDE, TouchMap, healthy_file, interpolated, write_healthy_map
+from surgsim_env.palpation.chart import MAP_SIDE, TouchMap, healthy_file, interpolated, write_healthy_map
 from surgsim_env.palpation.lesion_estimator import (
     BACKGROUND_SPREAD,
     EXCESS_SPREAD,
@@ -31,7 +31,7 @@ from surgsim_env.palpation.site_press import (
     press_phases,
     scan,
 )
-from surgsim_env.palpation.touches import Indenter, stiffest_spots
+from surgsim_env.palpation.touches import Indenter
 
 __all__ = [
     "BACKGROUND_SPREAD",
@@ -40,7 +40,6 @@ __all__ = [
     "FOUND_SHARE",
     "HOLD_TIME",
     "LESIONS_MOST",
-    "MAP_CELL",
     "MAP_SIDE",
     "ORGAN_MAP_SPREAD",
     "PRESS_SPEED",
@@ -63,7 +62,6 @@ __all__ = [
     "press_alone",
     "press_phases",
     "scan",
-    "stiffest_spots",
     "still_template",
     "strongest_apart",
     "write_healthy_map",

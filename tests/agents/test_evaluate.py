@@ -302,7 +302,7 @@ def test_all_methods_are_those_that_the_place_suits(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(evaluate, "evaluate", lambda player, options, console: played.append(player.name))
     surgsim("evaluate", "--all", "--scene", "phantom_wide", "--episodes", "1")
     assert {"raster_3", "raster_6", "sites_evolved", "palpate_organs", "gp_ucb"} <= set(played)
-    assert not {"raster_2", "raster_7", "palpate_phantom_small_scratch", "retract_dagger"} & set(played)
+    assert not {"raster_2", "raster_7", "retract_dagger"} & set(played)
 
 
 AGENT = """
@@ -390,7 +390,6 @@ def test_two_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("policy", "options", "message"),
     [
-        ("palpate_phantom_small_scratch", ["--scene", "phantom"], r"trained on the scene 'phantom_small', .* cannot"),
         ("retract_dagger", ["--level", "hard"], "level 'hard' has nothing to hide"),
         ("retract_dagger", ["--scene", "phantom"], r"scene 'phantom' has no \[retract\] table"),
     ],

@@ -12,8 +12,13 @@ import torch
 
 import surgsim_env  # noqa: F401
 from surgsim_apps.scoring.episodes import agent_generator
-from surgsim_apps.scoring.evaluate import policies_folder
-from surgsim_apps.training.policy_files import PolicyDescription, TrainedPolicy, load_policy, save_policy
+from surgsim_apps.training.policy_files import (
+    PolicyDescription,
+    TrainedPolicy,
+    load_policy,
+    observation_declaration,
+    save_policy,
+)
 from surgsim_apps.training.policy_network import NetworkLayout, PolicyNetwork, actor_of
 
 pytestmark = pytest.mark.agents
@@ -134,9 +139,11 @@ def test_files_that_are_missing_or_damaged_are_refused(path: Path):
 
 
 def test_a_policy_does_not_act_on_other_observations():
-    policy = load_policy(policies_folder() / "palpate_phantom_small_scratch.json")
-    policy.check_environment(gym.make(ENV_ID, scene="phantom_small", memory=True))
+    env = gym.make(ENV_ID, scene="phantom_small")
+    declared = observation_declaration(env)
+    policy = TrainedPolicy(network(), PolicyDescription(ENV_ID, {"scene": "phantom_small"}, declared))
+    policy.check_environment(env)
     with pytest.raises(ValueError, match="make the environment as the policy's file says"):
-        policy.check_environment(gym.make(ENV_ID, scene="phantom_small"))
+        policy.check_environment(gym.make(ENV_ID, scene="phantom_small", memory=True))
     with pytest.raises(ValueError, match=r"was trained on the scene 'phantom_small', .* cannot play 'phantom'"):
-        policy.check_environment(gym.make(ENV_ID, scene="phantom", memory=True))
+        policy.check_environment(gym.make(ENV_ID, scene="phantom"))

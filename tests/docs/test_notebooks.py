@@ -8,9 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
-NEEDS_AGENTS = {"train_an_agent"}
-# A minute or half each; `train_an_agent` takes as long, but is the one that is run where the `agents` extra is. The
-# tutorial of the same name has most of `own_patient`.
+# A minute or half each. The tutorial of the same name has most of `own_patient`.
 SLOW = {"stiffness_map", "two_arms", "own_patient"}
 
 
@@ -29,15 +27,9 @@ def maker():
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[pytest.mark.agents] * (name in NEEDS_AGENTS) + [pytest.mark.slow] * (name in SLOW))
-        for name in NAMES
-    ],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES]
 )
 def test_it_runs(name, maker, tmp_path):
-    if name in NEEDS_AGENTS:
-        pytest.importorskip("stable_baselines3", reason="needs the `agents` extra")
     notebook = maker.nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     done = maker.run_notebook(notebook, tmp_path)
     drawn = [output for cell in done.cells for output in cell.get("outputs", []) if maker.PNG in output.get("data", {})]

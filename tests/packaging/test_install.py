@@ -86,7 +86,7 @@ def test_installed_wheel_evaluates(wheel, make_environment, tmp_path, clean_envi
     environment.install(wheel)
     surgsim, here = environment.folder / "bin" / "surgsim", {"cwd": tmp_path, "env": clean_environ}
     common = ["--seeds", "3", "--results", "scores"]
-    run([surgsim, "evaluate", "--policy", "palpate_phantom_small_scratch", *common], **here)
+    run([surgsim, "evaluate", "--policy", "palpate_organs", "--scene", "phantom_small", *common], **here)
     run(
         [surgsim, "evaluate", "--policy", "sites_evolved", "--scene", "phantom_small", "--budget", "2", *common], **here
     )

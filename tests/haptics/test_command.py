@@ -130,6 +130,8 @@ def failing() -> None:
 )
 def test_the_steps_until_an_end_are_kept_whole(tmp_path, monkeypatch, end, code):
     """Ctrl-C is how a run ends that has no end of its own."""
+    # A shell's background jobs ignore SIGINT.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     class Interrupted(Pacer):
         def done(self, period) -> None:
@@ -142,7 +144,10 @@ def test_the_steps_until_an_end_are_kept_whole(tmp_path, monkeypatch, end, code)
 
     monkeypatch.setattr("surgsim_apps.cli.haptics.Pacer", Interrupted)
     out = tmp_path / "out"
-    assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == code
+    try:
+        assert main(["haptics", "--scene", "phantom_small", "--port", "0", "--out", str(out)]) == code
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert [path.name for path in out.iterdir()] == ["telemetry.csv"]
     with (out / "telemetry.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))

@@ -111,14 +111,21 @@ class TaskAgent:
     sees_truth: bool = False
 
 
-def _slide(make: Callable[[], Any]) -> TaskAgent:
+def _slide(make: Callable[[], Any], *, sees: bool = False) -> TaskAgent:
     """An agent of SurgSim/Slide-v0 that observes the map of the pressable sites."""
     return TaskAgent(
         SLIDE,
         lambda kwargs: AgentActor(make, lambda env: episode_facts(env, SLIDE, kwargs)),
         {"face": True},
-        sees_truth(make()),
+        sees,
     )
+
+
+def _slide_learned() -> Any:
+    # It needs torch.
+    from surgsim_apps.training.slide_network import SlideLearned
+
+    return SlideLearned()
 
 
 def _organ_expert(*, blind: bool) -> Actor:
@@ -131,7 +138,8 @@ def _organ_expert(*, blind: bool) -> Actor:
 TASK_AGENTS = {
     "expert_retract": TaskAgent("SurgSim/Retract-v0", lambda kwargs: RetractExpert().act_all, {"scaled": False}),
     "expert_organs": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=False), IN_FACE),
-    **{name: _slide(make) for name, make in SLIDES.items()},
+    **{name: _slide(make, sees=sees_truth(make())) for name, make in SLIDES.items()},
+    "slide_learned": _slide(_slide_learned),
     "blind_middle": TaskAgent("SurgSim/Palpate-v0", lambda kwargs: _organ_expert(blind=True), IN_FACE),
 }
 # Oracles that play a script, by environment.

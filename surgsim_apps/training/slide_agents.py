@@ -103,7 +103,7 @@ class SlideMemory:
 
 def pressure_centres(taxels: FloatArray) -> FloatArray:
     """Centres of the normal force on square patches of taxels (3 m, n), along both axes, in taxels, (n, 2)."""
-    push = np.maximum(taxels.reshape(-1, 3, taxels.shape[1])[:, 2], 0.0)
+    push = np.maximum(taxels[2::3], 0.0)
     side = math.isqrt(len(push))
     rows, columns = np.divmod(np.arange(len(push)), side)
     places = np.stack([columns, rows]) - 0.5 * (side - 1)

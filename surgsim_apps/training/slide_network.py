@@ -28,8 +28,11 @@ FORCE, NORMAL, TAXELS = 3, 6, slice(10, -4)
 SPOT, CENTROID_RADIUS = 1.0, 1.0
 # Least distance between declared lesions [tip radii].
 DISTANCE_LEAST = 2.0
-# Control steps of a decision.
+# Control steps between two maps.
 DECISION = 5
+# Least distance of a goal from readings and earlier goals [tip radii], and logits that a tip radius of way costs. Both
+# and the threshold of `SlideLearned` were chosen on the validation split.
+FRESH, WAY_COST = 1.2, 0.3
 
 
 def raster(memory: SlideMemory, *, remembers: bool = True) -> NDArray[np.float32]:
@@ -120,13 +123,14 @@ class SlideLearned(SlideSweep):
     """Slides where the network expects a lesion that it has not touched, and declares the lesions that it sees."""
 
     weights = WEIGHTS
-    # Least probability of a declared lesion, chosen on the validation split.
-    least = 0.3
+    # Least probability of a declared lesion.
+    least = 0.2
 
     def reset(self, rng: np.random.Generator, facts: Any) -> None:
         """Begin an episode."""
         super().reset(rng, facts)
         self.network = load_network(self.weights)
+        self.way, self.goals = Way(np.zeros((0, 2))), np.zeros((0, 2))
 
     def act(self, observation: NDArray[np.floating]) -> NDArray[np.float32]:
         """The next action."""
@@ -135,12 +139,26 @@ class SlideLearned(SlideSweep):
         else:
             self.memory.add(observation)
         memory = self.memory
-        if memory.steps % DECISION == 1:
+        velocity = self.way.velocity(memory.place)
+        if memory.steps % DECISION == 1 or self.way.goal is None:
             with torch.no_grad():
                 maps = self.network(torch.as_tensor(raster(memory, remembers=bool(self.network.remembers)))[None])[0]
-            heat, goal = torch.sigmoid(maps[0]).numpy().ravel(), maps[2].numpy().ravel()
-            points = declared_lesions(heat, memory.map.sites, self.least)
+            points = declared_lesions(torch.sigmoid(maps[0]).numpy().ravel(), memory.map.sites, self.least)
             self.declared = lesion_numbers(points, np.full(len(points), LESION_RADIUS), memory.map.extent)
-            self.way = Way(memory.map.sites[np.where(memory.map.pressable, goal, -np.inf).argmax()][None])
-        slide = np.clip(self.way.velocity(memory.place), -1.0, 1.0)
-        return np.concatenate([slide, [PRESS], self.declared]).astype(np.float32)
+            if self.way.goal is None:
+                self._choose(memory, maps[2].numpy().ravel())
+                velocity = self.way.velocity(memory.place)
+        # Without a fresh place left the tip lifts: a rest on the tissue doses it.
+        press = -1.0 if self.way.goal is None else PRESS
+        return np.concatenate([np.clip(velocity, -1.0, 1.0), [press], self.declared]).astype(np.float32)
+
+    def _choose(self, memory: SlideMemory, logits: NDArray[np.floating]) -> None:
+        """Choose the next goal among the sites far from all readings and all goals before."""
+        sites = memory.map.sites
+        known = np.concatenate([sites[memory.visited], self.goals])
+        squared = np.square(sites[:, None] - known).sum(axis=2).min(axis=1, initial=np.inf)
+        worth = logits - WAY_COST * np.linalg.norm(sites - memory.place, axis=1)
+        worth[~memory.map.pressable | (squared <= FRESH * FRESH)] = -np.inf
+        if np.isfinite(worth.max()):
+            goal = sites[worth.argmax()][None]
+            self.goals, self.way = np.concatenate([self.goals, goal]), Way(goal)

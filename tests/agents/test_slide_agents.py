@@ -1,5 +1,6 @@
 """Scripted and learned slides: ways over a face, the map from readings, and the trainer on a recorded slide."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -65,6 +66,7 @@ def test_the_centre_of_pressure_of_a_patch():
     forces = np.zeros((4, 4, 3))
     forces[2, 3, 2] = 2.0  # third row, last column
     assert pressure_centres(forces.reshape(48, 1)) == pytest.approx(np.array([[1.5, 0.5]]))
+    assert pressure_centres(np.zeros((48, 0))).shape == (0, 2)
 
 
 def played(name, seed, **settings):
@@ -231,3 +233,15 @@ def test_a_network_fits_a_slide_and_plays_from_its_file(recorded, learn, tmp_pat
         action = agent.act(observation)
         assert env.action_space.contains(action)
         observation, *_ = env.step(action)
+
+
+@pytest.mark.agents
+def test_the_shipped_network_maps_a_lesion_that_a_slide_passes(recorded):
+    from surgsim_apps.training.slide_network import SlideLearned
+
+    slices, observations, _ = recorded
+    agent = SlideLearned()
+    agent.reset(np.random.default_rng(0), SimpleNamespace(observation_slices=slices))
+    actions = np.array([agent.act(observation) for observation in observations])
+    assert (np.abs(actions) <= 1.0).all() and (actions[:, 2] > 0.0).all()
+    assert len(np.unique(agent.goals, axis=0)) == len(agent.goals) > 0

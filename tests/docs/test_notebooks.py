@@ -26,9 +26,7 @@ def maker():
     return script(ROOT / "docs" / "make_notebooks.py")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES])
 def test_it_runs(name, maker, tmp_path):
     notebook = maker.nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     done = maker.run_notebook(notebook, tmp_path)

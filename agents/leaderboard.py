@@ -50,6 +50,7 @@ NOTES = {
     "oracle_near": "presses lesions first, then around them",
     "middle": "blind guess",
     "slide_random": "declares no lesion",
+    "slide_learned": "imitation of `slide_oracle`, network of 184 000 numbers",
     "slide_oracle": "declares each lesion once it is touched",
 }
 

@@ -24,8 +24,12 @@ NAMES = sorted(path.stem for path in TUTORIALS.glob("*.md") if path.stem != "ind
 # The same in less time: what is written, and what runs here.
 QUICK = {
     "own_organ": [("--out runs/kidney", "--out runs/kidney --around 0.02,0.01,0.021,0.012")],
-    # Steps enough for each of the organs to end an episode of 80.
-    "train_an_agent": [("model.learn(32_768)", "model.learn(1_024)"), ("make_envs(16)", "make_envs(8)")],
+    "train_an_agent": [
+        ("model.learn(60_000)", "model.learn(1_024)"),
+        ("make_envs(16, shaping", "make_envs(8, shaping"),
+        ("scored = VecNormalize(make_envs(16)", "scored = VecNormalize(make_envs(8)"),
+        ("n_eval_episodes=96", "n_eval_episodes=8"),
+    ],
     # The evaluation looks for ports before all else; the slow test runs it.
     "own_robot": [("surgsim arms --left psm_grasper", "pip # --left psm_grasper")],
 }

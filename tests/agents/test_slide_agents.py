@@ -237,6 +237,7 @@ def test_a_network_fits_a_slide_and_plays_from_its_file(recorded, learn, tmp_pat
 
 @pytest.mark.agents
 def test_the_shipped_agent_presses_on_and_takes_a_new_goal_each_time(recorded):
+    pytest.importorskip("torch", reason="needs the `agents` extra")
     from surgsim_apps.training.slide_network import SlideLearned
 
     slices, observations, _ = recorded

@@ -54,21 +54,16 @@ NOTES = {
     "slide_oracle": "declares each lesion once it is touched",
 }
 
-HEADER = f"""# Leaderboard
+HEADER = """# Leaderboard
 
-In `SurgSim/PalpateSites-v0` an agent chooses where to press an organ, and one common estimator locates the
-lesions. Methods are ordered by the **area under the error curve**: the error (OSPA) of the estimated lesions after each
-press, averaged over presses and episodes, with its 95 % bootstrap interval, over organs where there are several. All
-methods of a table play the same episodes; of the rasters the best is shown. Definitions: `docs/palpation.md`.
+In `SurgSim/PalpateSites-v0` an agent chooses where to press an organ, and one common estimator locates the lesions; in
+`SurgSim/Slide-v0` it slides over an organ without a map of the healthy one, and declares the map of lesions itself.
+All methods of a table play the same episodes; organs of a "test split" served for no method's training.
 
-"never": not within the presses of an episode. **sees truth**: the method knows the lesions. The engine has physics
-{PHYSICS_VERSION}; "physics" with another number: played on an older version and not since. `openhelp_...` are organs of
-one CT scan (`docs/patient.md`). `python -m agents.leaderboard` writes this page from `agents/results/*.json`, which
-have the numbers of each episode, the intervals of all figures and the command of each row.
+## Best methods
+
 """
 BLOCKS = """
-## Blocks: a smoke test
-
 Random presses with the common estimator close most of the way from the blind guess here: a block shows that a method
 works, not that it is better. Rank methods on organs.
 """
@@ -88,20 +83,56 @@ episodes would tell them apart.
 * An agent may report its own estimate instead of the common estimator's: the row says **own estimate**.
 * The seeds of the rows on this page are public.
 """
+DEFINITIONS = f"""
+## Definitions
+
+Methods of PalpateSites are ordered by the **area under the error curve**: the error (OSPA) of the estimated lesions
+after each press, averaged over presses and episodes; those of Slide by the **map score**, averaged over the time
+(`docs/environments/slide.md`). In brackets: the 95 % bootstrap interval, over organs where there are several. Further
+figures: `docs/palpation.md`. Of the rasters the best is shown.
+
+"never": not within the presses of an episode. **sees truth**: the method knows the lesions. The engine has physics
+{PHYSICS_VERSION}; "physics" with another number: played on an older version and not since. `openhelp_...` are organs of
+one CT scan (`docs/patient.md`). `python -m agents.leaderboard` writes this page from `agents/results/*.json`, which
+have the numbers of each episode, the intervals of all figures and the command of each row.
+"""
 
 
 def write_leaderboard(folder: Path, path: Path) -> None:
     """Write the page of all results of a folder."""
     results = sorted(load_results(folder), key=_order)
-    parts = [HEADER]
-    for is_block, group in groupby((row for row in results if row.env_id == SITES), key=_is_block):
-        parts += [BLOCKS] * is_block
-        parts += [_presses(list(rows)) for _, rows in groupby(group, key=lambda row: row.place)]
-    parts.append(SUBMISSION)
-    for env_id, rows in groupby((row for row in results if row.env_id != SITES), key=lambda row: row.env_id):
-        parts.append(f"\n## `{env_id}`\n\n{_table(list(rows), MAPS if env_id == SLIDE else STEPS)}\n")
+    places = [best_raster_alone(list(rows)) for _, rows in groupby(results, key=lambda row: row.place)]
+    best = ["environment", "scene", "figure", "best method", "", "next", ""]
+    lines = [_line(best), _line(["---"] * len(best)), *(_line(cells) for cells in map(_best, places) if cells)]
+    parts = [HEADER, "\n".join(lines), "\n\n## All methods\n", *map(_folded, places), SUBMISSION, DEFINITIONS]
     with output_folder(path.parent) as files:
         (files / path.name).write_text("".join(parts), encoding="utf-8")
+
+
+def _best(rows: Sequence[Result]) -> list[str]:
+    """Cells of the best two methods of a place; none where all see the truth."""
+    honest = [row for row in rows if not (row.sees_truth or row.own_estimate)][:2]
+    if not honest:
+        return []
+    column = _columns(rows[0])[0]
+    cells = [cell for row in honest for cell in (_name(row), _cell(row.figures.get(column[1]), column, True))]
+    return [_environment(rows[0]), _title(rows[0]), column[0], *cells, *[""] * (4 - len(cells))]
+
+
+def _environment(result: Result) -> str:
+    return result.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+
+
+def _columns(result: Result) -> Sequence[Column]:
+    return {SITES: PRESSES, SLIDE: MAPS}.get(result.env_id, STEPS)
+
+
+def _folded(rows: list[Result]) -> str:
+    """A table under its title, opened by a click."""
+    first = rows[0]
+    title = f"{_environment(first)} {'on ' * bool(first.scene)}{_title(first).replace('`', '')}"
+    text = (_presses if first.env_id == SITES else _steps)(rows)
+    return f"\n<details markdown><summary>{title}</summary>\n{text}\n</details>\n"
 
 
 def _is_block(result: Result) -> bool:
@@ -129,15 +160,22 @@ def best_raster_alone(rows: Sequence[Result]) -> list[Result]:
 
 
 def _presses(rows: list[Result]) -> str:
-    rows = best_raster_alone(rows)
     first = max(rows, key=lambda row: row.budget)
     lesions = first.lesion_counts
-    organs = f" of {len(set(first.members))} organs" if first.members else " on one organ"
     text = (
-        f"\n{'#' * (3 if _is_block(first) else 2)} {_title(first)}\n\n{len(lesions)} episodes{organs}, {sum(lesions)} "
-        f"lesions, {lesions.count(0)} episodes without one, {first.budget} presses.\n\n{_table(rows, PRESSES)}\n"
+        f"\n{_episodes(first)}, {sum(lesions)} lesions, {lesions.count(0)} episodes without one, {first.budget} "
+        f"presses.\n\n{_table(rows)}\n"
     )
-    return text if _is_block(first) else text + "".join(f"\n{line}\n" for line in _head_room(rows))
+    return BLOCKS + text if _is_block(first) else text + "".join(f"\n{line}\n" for line in _head_room(rows))
+
+
+def _steps(rows: list[Result]) -> str:
+    return f"\n{_episodes(rows[0])}.\n\n{_table(rows)}\n"
+
+
+def _episodes(result: Result) -> str:
+    organs = f"of {len(set(result.members))} organs" if result.members else "on one organ"
+    return f"{len(result.seeds)} episodes {organs}"
 
 
 def _head_room(rows: Sequence[Result]) -> Iterator[str]:
@@ -172,13 +210,13 @@ def _title(result: Result) -> str:
     return f"`{result.scene}` ({in_brackets})".removesuffix(" ()").removeprefix("``").strip()
 
 
-def _table(rows: Sequence[Result], columns: Sequence[Column]) -> str:
-    scene = columns is not PRESSES
-    head = [*["scene"] * scene, "method", *(column[0] for column in columns), "note"]
+def _table(rows: Sequence[Result]) -> str:
+    columns = _columns(rows[0])
+    head = ["method", *(column[0] for column in columns), "note"]
     lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:
         cells = [_cell(row.figures.get(column[1]), column, index == 0) for index, column in enumerate(columns)]
-        lines.append(_line([*[_title(row)] * scene, _name(row), *cells, _note(row)]))
+        lines.append(_line([_name(row), *cells, _note(row)]))
     return "\n".join(lines)
 
 

@@ -102,16 +102,16 @@ class PalpateTask(Task):
     `Box(-1, 1, (4,), float32)`
 
     ## Observation Space
-    `Box((10,), float32)`, all bounds finite. With `memory="summary"` seven numbers more, enough for a small network:
+    `Box((11,), float32)`, all bounds finite. With `memory="summary"` seven numbers more, enough for a small network:
     how much of the face was felt, and the ways to the stiffest place and to fresh sites. With `memory=True`
-    `Box((5056,), float32)`: what the sensor felt so far (`surgsim_env.palpation.touches`) on a map of n = 41 x 41
+    `Box((5057,), float32)`: what the sensor felt so far (`surgsim_env.palpation.touches`) on a map of n = 41 x 41
     sites, 0.4 tip radii apart, over the middle of the palpable face (`surgsim_env.palpation.chart`), row by row, the
     same size for every organ; farther apart where 16 tip radii do not span the face.
     `env.unwrapped.observation_slices` has the entries of each channel by its name.
 
     An instrument with taxels has three numbers more for each (`scenes/README.md`).
 
-    With `frame="face"` ten numbers more, with `memory=True` 13: where the tip is on the organ's registered surface at
+    With `frame="face"` nine numbers more, with `memory=True` 12: where the tip is on the organ's registered surface at
     rest, in tip radii and on the axes of its face (`surgsim_env.palpation.face_frame`), which commands are along too.
     A policy that reads these and the maps alone can play organs of any size and pose.
 
@@ -216,12 +216,12 @@ class PalpateTask(Task):
             size_text="3 or 0", bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
         ),
         Channel(
-            "tip_depth", _in_frame(1), "m",
+            "tip_depth", 1, "m",
             low=lambda task, instrument: -PLACE_BOUND * _tip_radius(task, instrument),
             high=lambda task, instrument: PLACE_BOUND * _tip_radius(task, instrument),
             read=lambda task, simulation: task.tip_depth,
-            meaning='with `frame="face"`: depth of the ball below the surface at rest',
-            size_text="1 or 0", bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
+            meaning="depth of the ball below the surface at rest",
+            bounds_text="+-1000 tip radii", scale=_tip_radius, scale_text="tip radius",
         ),
         Channel(
             "surface_normal", _in_frame(3), "", -1.0, 1.0,
@@ -399,9 +399,7 @@ class PalpateTask(Task):
 
     def update(self, step: ControlStep) -> None:
         """Measure the ball's depth below the surface at rest, and add the force reading to the memory."""
-        memory, frame = self.memory, self.frame
-        if memory is None and frame is None:
-            return
+        memory = self.memory
         tip = self.resting_place(step.simulation)
         surface, normal = self.anatomy.face.project(tip)
         depth = self.charted.tip_radius - float(matmul(tip - surface, normal))

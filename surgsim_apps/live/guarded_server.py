@@ -23,8 +23,8 @@ LOOPBACK = "127.0.0.1"
 OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 # Sockets of keyboards, gamepads and frame rates: `hand.js` opens them.
 HAND_PATH = "/hand"
-# In this order: the second sends the server what the first counts.
-SCRIPTS = ("drawing.js", "hand.js")
+# In this order: later ones use what the first makes.
+SCRIPTS = ("drawing.js", "hand.js", "overlay.js")
 
 HandServer = Callable[[ServerConnection], Awaitable[None]]
 Answer = Callable[[ServerConnection, Request], Response | None]

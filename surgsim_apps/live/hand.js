@@ -1,5 +1,5 @@
 // Keys and gamepads steer the instrument: packets as messages.py has them, 40 times a second while something is held.
-// A browser without a graphics card tells the server (drawing.js).
+// A browser without a graphics card tells the server (drawing.js). What the server sends, overlay.js shows.
 (() => {
   "use strict";
   const PERIOD = 25, DEAD = 0.12;
@@ -8,9 +8,11 @@
   const connect = () => {
     // Below the page's own address, which begins with the token.
     socket = new WebSocket(location.origin.replace(/^http/, "ws") + location.pathname.replace(/\/$/, "") + "/hand");
+    socket.onmessage = (event) => window.surgsim.show(JSON.parse(event.data));
     socket.onopen = () => { if (window.surgsim.software) socket.send(new TextEncoder().encode("software")); };
     socket.onclose = () => { socket = null; setTimeout(connect, 1000); };
   };
+  window.surgsim.send = (text) => { if (socket?.readyState === WebSocket.OPEN) socket.send(new TextEncoder().encode(text)); };
   const typing = () => {
     const at = document.activeElement;
     return at !== null && (at.isContentEditable || ["INPUT", "TEXTAREA", "SELECT"].includes(at.tagName));

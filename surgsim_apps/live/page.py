@@ -2,21 +2,24 @@
 
 import asyncio
 import contextlib
+import json
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import ServerConnection, broadcast
 from websockets.exceptions import ConnectionClosed
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.pacing import timeliness
 from surgsim_apps.live.exchange_records import Change, LiveError, Pause, Phase, Record, Reset
 from surgsim_apps.live.guarded_server import GuardedServer
-from surgsim_apps.live.messages import SOFTWARE, read_hand
-from surgsim_apps.live.organ_choice import chosen_lesions
+from surgsim_apps.live.lesion_search import LesionSearch
+from surgsim_apps.live.messages import MARK, SEARCH, SOFTWARE, read_hand
+from surgsim_apps.live.organ_choice import HIDDEN, chosen_lesions, lesion_kinds
 from surgsim_apps.live.painted_tissue import PaintedTissue
 from surgsim_apps.live.panel import Panel, status_rows
 from surgsim_apps.live.recording import write_recording
@@ -24,6 +27,7 @@ from surgsim_apps.live.session import Session
 from surgsim_apps.live.stage import (
     SCALE,
     STIFFNESS_MAP,
+    Aim,
     FeltMap,
     ForceArrow,
     InstrumentView,
@@ -38,6 +42,9 @@ PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
 END_TIMEOUT = 2.0
 # Time between pictures [s].
 PICTURE_PERIOD = 1.0 / 30.0
+# Depth of a press with shift over the chosen depth.
+DEEPER = 1.6
+STEERING = "Press and hold on the organ, drag to slide, shift to press deeper. Drag beside it to turn the view."
 
 
 class HandSockets:
@@ -47,20 +54,34 @@ class HandSockets:
         software: True once a tab without a graphics card was opened
     """
 
-    def __init__(self, session: Session) -> None:
-        """Push a session's hands."""
-        self._session = session
+    def __init__(self, session: Session, calls: dict[bytes, Callable[[], None]]) -> None:
+        """Push a session's hands; `calls` are made at their packets."""
+        self._session, self._calls = session, calls
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._connections: set[ServerConnection] = set()
         self.software = False
 
     async def serve(self, connection: ServerConnection) -> None:
         """Serve one tab until it is closed."""
-        with contextlib.suppress(ConnectionClosed, asyncio.CancelledError):
-            while True:
-                message = await connection.recv(decode=False)
-                if message == SOFTWARE:
-                    self.software = True
-                else:
-                    self._session.push(read_hand(message))
+        self._loop = asyncio.get_running_loop()
+        self._connections.add(connection)
+        try:
+            with contextlib.suppress(ConnectionClosed, asyncio.CancelledError):
+                while True:
+                    message = await connection.recv(decode=False)
+                    if message == SOFTWARE:
+                        self.software = True
+                    elif message in self._calls:
+                        self._calls[message]()
+                    else:
+                        self._session.push(read_hand(message))
+        finally:
+            self._connections.discard(connection)
+
+    def send(self, state: dict[str, Any]) -> None:
+        """Send a state to all tabs; one that does not keep up loses it."""
+        if self._loop is not None and self._connections:
+            self._loop.call_soon_threadsafe(broadcast, self._connections.copy(), json.dumps(state))
 
 
 class Page:
@@ -69,6 +90,7 @@ class Page:
     Fields:
         session, server: the physics' side and the browsers' side
         felt: stiffness map of this organ from the touches so far
+        search: for a hidden lesion
         pictures: number of pictures sent
     """
 
@@ -84,7 +106,8 @@ class Page:
             LiveError: see `GuardedServer`.
         """
         self.session, self._out = session, out
-        self._tabs = HandSockets(session)
+        self.search = LesionSearch(session.anatomy)
+        self._tabs = HandSockets(session, {SEARCH: self._begin_search, MARK: self._mark})
         self.server = GuardedServer(port, self._tabs.serve)
         self.felt = FeltMap(session.anatomy)
         self._tissue, self._chosen_paint = PaintedTissue(session), STIFFNESS_MAP
@@ -92,7 +115,7 @@ class Page:
         self._shares = self._painter.submit(self._tissue.shares)
         self.pictures = 0
         self._organ_number, self._traced = 1, 0
-        self._grabs: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._dragged_arm = 0
         self._held: set[int] = set()
         self._shows_lesions = False
         # Number of recordings written; the physics counts those begun.
@@ -106,6 +129,7 @@ class Page:
             self._surroundings = Surroundings(viser, session.anatomy)
             session.directions = self._surroundings.directions
             self._organ = OrganView(viser.scene, session.anatomy)
+            self._organ.on_drag(self._pressed)
             self._add_instrument()
             self._panel = Panel(
                 viser.gui,
@@ -119,13 +143,14 @@ class Page:
         """The instrument, a handle at each hand, an arrow of force at each tip."""
         session, scene = self.session, self.server.viser.scene
         self._instrument = InstrumentView(scene, session.instrument.model, session.geoms, session.arm_count)
-        self._instrument.on_drag(self._dragged)
+        self._instrument.on_drag(self._touched)
         size = float(np.ptp(session.anatomy.mesh.points, axis=0).max())
         self._handles = [
             add_handle(scene, arm, place, size, session.directions, self._pulled)
             for arm, place in enumerate(session.parked)
         ]
         self._arrows = [ForceArrow(scene, arm, size) for arm in range(session.arm_count)]
+        self._aims = [Aim(scene, arm, session.scene.instrument.tip_radius) for arm in range(session.arm_count)]
 
     def _calls(self) -> dict[str, Callable[..., None]]:
         """Callbacks of the panel; a click toggles the current state, even if a button's label lags behind."""
@@ -170,6 +195,7 @@ class Page:
                     self._show(frame)
                     if now >= plot_due:
                         plot_due = now + PLOT_PERIOD
+                        self._tabs.send(self._overlay(frame))
                         self._panel.plot(self.session.trace())
                         if frame["taxel"].size:
                             self._panel.show_taxels(frame["taxel"])
@@ -206,14 +232,51 @@ class Page:
         if phase == "end":
             self._held.discard(arm)
 
-    def _dragged(self, arm: int, phase: str, pointer: FloatArray) -> None:
-        """The instrument itself is dragged across the view."""
-        if phase == "start" or arm not in self._grabs:
-            self._grabs[arm] = (self.session.targets[arm], pointer)
-        start, grabbed = self._grabs[arm]
-        self.session.move_to(arm, start + pointer - grabbed)
+    def _pressed(self, phase: str, eye: FloatArray, pointer: FloatArray, deeper: bool) -> None:
+        """The organ is pressed, by the nearest tip."""
+        if phase == "start":
+            tips = self.session.frame()["tip"]
+            self._dragged_arm = int(np.argmin(np.linalg.norm(tips - pointer, axis=1)))
+        self._touched(self._dragged_arm, phase, eye, pointer, deeper)
+
+    def _touched(self, arm: int, phase: str, eye: FloatArray, pointer: FloatArray, deeper: bool) -> None:
+        """A pointer drags an arm over the organ; beside the organ it stays where it pressed last."""
         if phase == "end":
-            del self._grabs[arm]
+            self.session.lift(arm)
+        elif (hit := self._organ.hit(eye, pointer)) is not None:
+            self.session.touch(arm, *hit, self._panel.press_depth * (DEEPER if deeper else 1.0))
+
+    def _begin_search(self) -> None:
+        self.search.begin()
+        self._panel.hide(self.search.seed)
+        self._panel.show_lesions(False)
+
+    def _mark(self) -> None:
+        self.search.mark(chosen_lesions(self.session.anatomy, self.session.choice))
+        self._panel.show_lesions(not self.search.open)
+
+    def _overlay(self, frame: np.ndarray) -> dict[str, Any]:
+        """What `overlay.js` shows: force and limits [N], texts, the button and its packet, the tone."""
+        search, limits = self.search, self.session.scene.limits
+        text, button, sends = "", "Find the hidden lesion", SEARCH
+        if search.open:
+            text = f"{search.presses} presses: where is it stiffest?"
+            button, sends = "It is where I pressed last", MARK
+        elif search.guess is not None:
+            guess = search.guess
+            effort = f"{guess.presses} presses, at most {guess.force_peak:.2f} N"
+            text = f"{1e3 * guess.error:.1f} mm from the lesion\n{effort}\n{guess.points} points of 100"
+            button = "Find another"
+        return {
+            "force": np.linalg.norm(frame["force"], axis=1).tolist(),
+            "soft": limits.soft_force,
+            "hard": limits.hard_force,
+            "text": text,
+            "button": button if HIDDEN in lesion_kinds(self.session.scene) else "",
+            "sends": sends.decode(),
+            "steer": STEERING,
+            "tone": self._panel.tone,
+        }
 
     def _reset(self) -> None:
         self.session.park()
@@ -257,7 +320,10 @@ class Page:
         for index in range(max(self._traced, count - len(rows)), count):
             row = rows[index % len(rows)]
             for arm in range(self.session.arm_count):
-                self.felt.feel(row["tip"][arm], float(row["depth"][arm]), float(np.linalg.norm(row["force"][arm])))
+                force = float(np.linalg.norm(row["force"][arm]))
+                self.felt.feel(row["tip"][arm], float(row["depth"][arm]), force)
+                if self.search.open:
+                    self.search.feel(row["tip"][arm].copy(), force)
         self._traced = count
 
     def _show(self, frame: np.ndarray) -> None:
@@ -265,8 +331,10 @@ class Page:
         self._paint()
         self._organ.follow(frame["node"].astype(np.float64))
         self._instrument.follow(frame["geom"], frame["turn"])
-        for arrow, tip, force in zip(self._arrows, frame["tip"], frame["force"], strict=True):
+        face = self.session.anatomy.face
+        for arrow, aim, tip, force in zip(self._arrows, self._aims, frame["tip"], frame["force"], strict=True):
             arrow.follow(tip, force)
+            aim.follow(tip, *face.project(tip))
         targets = self.session.targets
         for arm, handle in enumerate(self._handles):
             if arm not in self._held and np.abs(handle.position / SCALE - targets[arm]).max() > 1e-6:

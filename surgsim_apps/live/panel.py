@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surgsim_apps.haptics.pacing import Timeliness
 from surgsim_apps.live.exchange_records import Phase
 from surgsim_apps.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
-from surgsim_apps.live.stage import CONTRASTS, NOTHING, STIFFNESS_MAP, paint_colours
+from surgsim_apps.live.stage import CONTRASTS, LEVELS, NOTHING, STIFFNESS_MAP
 from surgsim_env.rendering import PAINTED_FIELDS, field_colours
 from surgsim_env.scene import Scene
 
@@ -41,7 +41,7 @@ TITLES = {
 STEERING = """
 | | |
 |---|---|
-| mouse | drag the probe, or an arrow of its handle |
+| mouse | press and hold on the organ, drag to slide, shift to press deeper; or drag an arrow of the handle |
 | arrow keys | across the organ |
 | Page up / down | out / in (also shift + up / down) |
 | gamepad | left stick across, triggers out / in |{jaw}{second}
@@ -79,14 +79,17 @@ class Panel:
         self._gui, self._scene, self._calls = gui, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
         self._changed: float | None = None
-        self._status = gui.add_html(_status_html("starting", []))
+        self._headline = gui.add_html(_status_html("starting", []))
         self._add_buttons()
         self._jaw = self._checkbox("Close the jaw", "close_jaw", visible=has_jaw)
         hint = "the present breath ends, and no other begins; the heart goes on"
         self._breath = self._checkbox("Hold the breath", "hold_breath", visible=scene.has_breath, hint=hint)
+        depth = round(1e3 * scene.palpation.press_depth, 1)
+        self._press_depth = self._slider("Press depth [mm]", 0.25, 2.0, 0.05, 1.0, depth)
         with gui.add_folder("Force and depth"):
             self._force = _plot(gui, "N", arm_count)
             self._depth = _plot(gui, "mm", arm_count)
+            self._tone = gui.add_checkbox("Tone at the limits of force", initial_value=False)
         self._taxels = gui.add_html("", visible=False)
         with gui.add_folder("Tissue"):
             self._add_tissue()
@@ -96,6 +99,8 @@ class Panel:
             self._legend = gui.add_html(_legend_html(STIFFNESS_MAP, 0.0))
             self._clear = self._button("Clear", "clear the stiffness map", calls["clear_map"])
         self._plain = self._checkbox("Plain light", "plain", hint="faster without a graphics card")
+        with gui.add_folder("Timing", expand_by_default=False):
+            self._status = gui.add_html("")
         with gui.add_folder("How to steer", expand_by_default=False):
             second = "\n| X, or a shoulder button | the other arm |" if arm_count > 1 else ""
             jaw = "\n| G, or the first button | close or open the jaw |" if has_jaw else ""
@@ -110,7 +115,28 @@ class Panel:
 
     def show_status(self, frame: NDArray[Any], rows: list[tuple[str, str]]) -> None:
         """Show the state of the physics in a frame, and names with values."""
-        self._status.content = _status_html(headline(frame), rows)
+        _set(self._headline, "content", _status_html(headline(frame), [row for row in rows if not row[0]]))
+        self._status.content = _status_html("", [row for row in rows if row[0]])
+
+    @property
+    def press_depth(self) -> float:
+        """Depth of a press by the pointer [m]."""
+        return self._press_depth.value / 1e3
+
+    @property
+    def tone(self) -> bool:
+        """True if a tone sounds at the limits of force."""
+        return self._tone.value
+
+    def show_lesions(self, on: bool) -> None:
+        """Set its check box, which calls."""
+        _set(self._show_lesions, "value", on)
+
+    def hide(self, seed: int) -> None:
+        """Hide a lesion, at once."""
+        self._lesions.value = HIDDEN
+        self._choose(seed=seed)
+        self._changed = time.monotonic() - SETTLED
 
     def show_phase(self, frame: NDArray[Any], recorded: float, *, jaw_closed: bool, breath_held: bool) -> None:
         """Label the buttons with the effect of a click; `recorded` is the length of the recording [s]."""
@@ -139,10 +165,11 @@ class Panel:
         """Show a trace's rows: time [s], force [N] and depth [m] of each arm."""
         if len(trace) < 2:
             return
+        # Seconds before now: a fixed window, also for a tab that is loaded again.
         now = float(trace["time"][-1])
         trace = trace[trace["time"] >= now - PLOTTED]
         trace = trace[:: max(1, len(trace) // PLOT_POINTS)]
-        since = np.ascontiguousarray(trace["time"])
+        since = trace["time"] - now
         force = np.linalg.norm(trace["force"], axis=2)
         for plot, unit, values in ((self._force, "N", force), (self._depth, "mm", trace["depth"] * 1e3)):
             top = PLOT_LEAST[unit]
@@ -170,11 +197,13 @@ class Panel:
         )
         self._ratio = self._slider("Lesions' modulus / tissue's", 1.0, 12.0, 0.5, min(float(ratio), 12.0))
         self._size = self._slider("Lesions' size", 0.5, 1.3, 0.05, 1.0)
-        hide = self._button("Hide another lesion", "draw one from the scene's ranges", self._hide)
+        hide = self._button(
+            "Hide another lesion", "draw one from the scene's ranges", lambda: self.hide(self.choice.seed + 1)
+        )
         hide.visible = HIDDEN in kinds
         for control in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
             control.on_update(lambda _: self._choose())
-        self._checkbox("Show lesions", "show_lesions")
+        self._show_lesions = self._checkbox("Show lesions", "show_lesions")
 
     def _choose(self, **changes: Any) -> None:
         scene = self._scene
@@ -187,12 +216,6 @@ class Panel:
             seed=changes.get("seed", self.choice.seed),
         )
         self._changed = time.monotonic()
-
-    def _hide(self) -> None:
-        self._lesions.value = HIDDEN
-        self._choose(seed=self.choice.seed + 1)
-        # A click applies at once.
-        self._changed = time.monotonic() - SETTLED
 
     def _slider(self, label: str, low: float, high: float, step: float, start: float, unit: float = 1.0) -> Any:
         values = [round(value * unit, 6) for value in (low, high, step, start)]
@@ -217,7 +240,7 @@ def _set(handle: Any, name: str, value: object) -> None:
 
 
 def _scales(top: float) -> dict[str, Any]:
-    return {"x": {"time": False, "auto": True}, "y": {"auto": False, "min": 0.0, "max": top}}
+    return {"x": {"time": False, "range": (-PLOTTED, 0.0)}, "y": {"auto": False, "min": 0.0, "max": top}}
 
 
 def _plot(gui: Any, unit: str, arm_count: int) -> Any:
@@ -279,7 +302,7 @@ def _legend_html(kind: str, end: float) -> str:
     text = f"stiffness over the lower quartile: {low:g} to {high:g} and more"
     if kind in PAINTED_FIELDS:
         text = PAINTED_FIELDS[kind].scale_text(end)
-    colours = ", ".join(f"rgb{colour}" for colour in paint_colours(kind))
+    colours = ", ".join(f"rgb{tuple(colour)}" for colour in field_colours(LEVELS).tolist())
     return (
         '<div style="padding:.2em .9em;font-size:.8em"><div style="height:.7em;border-radius:.35em;'
         f'background:linear-gradient(to right, {colours})"></div>{text}</div>'
@@ -310,9 +333,7 @@ def status_rows(
         message: of the page, shown if the physics has none.
         has_breath: True if the patient can hold the breath.
     """
-    forces = " / ".join(f"{float(np.linalg.norm(force)):.2f}" for force in frame["force"])
     rows = [
-        ("force, left / right arm" if len(frame["force"]) > 1 else "force", f"{forces} N"),
         ("simulated time", f"{float(frame['time']):.1f} s"),
         ("physics", f"{kept.rate:.0f} steps/s"),
         ("real-time factor", f"{kept.real_time:.3f}"),
@@ -322,7 +343,7 @@ def status_rows(
         ("pictures", f"{fps:.0f} /s"),
     ]
     if has_breath:
-        rows.insert(2, ("breath", "held" if frame["breath_held"] else "goes on"))
+        rows.insert(1, ("breath", "held" if frame["breath_held"] else "goes on"))
     if float(frame["added_mass"]) > 0.0:
         rows.append(("mass added for the step", f"{float(frame['added_mass']) * 1e3:.1f} g"))
     words = bytes(frame["message"]).decode("utf-8", "replace") or message

@@ -1,11 +1,13 @@
 """A live session in the page's process: motions of the hands, requests to the physics, its frames."""
 
 import contextlib
+import math
 import multiprocessing
 import os
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,10 +37,25 @@ from surgsim_env.scene import Anatomy
 BEAT_RATE, HELD = 100.0, 0.15
 # Speed of a target at full deflection [m/s].
 HAND_SPEED = 0.04
+# Speed of a target on its way to a touch, and while it presses and slides [m/s]; its clearance before and after, and
+# the longest slide behind a pointer [m].
+TOUCH_SPEED, PRESS_SPEED, CLEARANCE, SLIDE_MOST = 0.15, 0.05, 0.008, 0.015
 # Buttons for closing a jaw (JAW_BIT of `HapticSettings`), and for holding the breath, of the first arm.
 JAW_BUTTON, BREATH_BUTTON = 1, 1 << BREATH_BIT
 # Longest start, with an empty numba cache [s].
 START_TIMEOUT = 300.0
+
+
+@dataclass
+class _Touch:
+    """A touch of one hand: the pressed place at rest [m], the outward normal there, the depth [m]."""
+
+    place: FloatArray
+    outward: FloatArray
+    depth: float
+    # True once the tip is above the place; False once the pointer has let go.
+    arrived: bool = False
+    held: bool = True
 
 
 class Session:
@@ -82,6 +99,7 @@ class Session:
         self._targets = self.parked.copy()
         self._buttons = np.zeros(len(self.parked), dtype=np.int64)
         self._motions: dict[int, tuple[FloatArray, float]] = {}
+        self._touches: dict[int, _Touch] = {}
         self._clock = clock
         self._lock = threading.Lock()
         spawn = multiprocessing.get_context("spawn")
@@ -176,11 +194,33 @@ class Session:
     def move_to(self, arm: int, target: FloatArray) -> None:
         """Set the target of a hand [m], (3,), limited to the tip's workspace plus a margin of 1 cm."""
         with self._lock:
+            self._touches.pop(arm, None)
             self._targets[arm] = np.clip(target, self.instrument.lower - 0.01, self.instrument.upper + 0.01)
+
+    def touch(self, arm: int, place: FloatArray, outward: FloatArray, depth: float) -> None:
+        """Press a place of the surface at rest to a depth; a hand that presses nearby slides, others come from above.
+
+        Args:
+            arm: index of the hand.
+            place: on the surface at rest [m], (3,).
+            outward: unit normal of the surface there, (3,).
+            depth: of the tip's ball below the surface at rest [m].
+        """
+        with self._lock:
+            before = self._touches.get(arm)
+            slides = before is not None and before.arrived and math.dist(place, before.place) < SLIDE_MOST
+            self._touches[arm] = _Touch(place, outward, depth, arrived=slides)
+
+    def lift(self, arm: int) -> None:
+        """End a touch: the hand leaves along the normal."""
+        with self._lock:
+            if arm in self._touches:
+                self._touches[arm].held = False
 
     def park(self) -> None:
         """Set all targets to the parked positions."""
         with self._lock:
+            self._touches.clear()
             self._targets[:] = self.parked
 
     def push(self, motion: HandMotion) -> None:
@@ -190,6 +230,8 @@ class Session:
         """
         arm = motion.arm % self.arm_count
         with self._lock:
+            if any(motion.axes):
+                self._touches.pop(arm, None)
             self._motions[arm] = (np.array(motion.axes), self._clock())
             if motion.turns_jaw:
                 self._buttons[arm] ^= JAW_BUTTON
@@ -238,7 +280,22 @@ class Session:
                         continue
                     moved = self._targets[arm] + passed * HAND_SPEED * (axes @ self.directions)
                     self._targets[arm] = np.clip(moved, self.instrument.lower, self.instrument.upper)
+                for arm, touch in list(self._touches.items()):
+                    self._follow(arm, touch, passed)
                 self._show_hands()
+
+    def _follow(self, arm: int, touch: _Touch, passed: float) -> None:
+        """Move a hand towards its touch for a time [s]."""
+        presses = touch.held and touch.arrived
+        height = self.scene.instrument.tip_radius + (-touch.depth if presses else CLEARANCE)
+        way = touch.place + height * touch.outward - self._targets[arm]
+        length, most = float(np.linalg.norm(way)), passed * (PRESS_SPEED if touch.arrived else TOUCH_SPEED)
+        moved = self._targets[arm] + way * min(1.0, most / max(length, 1e-12))
+        self._targets[arm] = np.clip(moved, self.instrument.lower, self.instrument.upper)
+        if length <= most and not presses:
+            touch.arrived = True
+            if not touch.held:
+                del self._touches[arm]
 
     def _press(self, button: int, pressed: bool) -> None:
         """Press a button of the first arm's hand, or let it go."""

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from msdm_core.material import Lesion
@@ -14,6 +16,7 @@ from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.palpation import Indenter
 from surgsim_env.rendering import (
     Camera,
+    clip_triangles,
     field_colours,
     geom_colour,
     is_support,
@@ -34,9 +37,10 @@ _KIND = {
 }
 
 HAND_COLOURS = ((255, 146, 43), (77, 171, 247))
-GROUND_COLOUR, FORCE_COLOUR, BRAND_COLOUR = (28, 58, 66), (255, 224, 102), (232, 89, 12)
-# Distance of the ground below the organ [m], and its half size in sizes of the organ.
-GROUND_GAP, GROUND_REACH = 0.002, 4.0
+FAT_COLOUR, FORCE_COLOUR, BRAND_COLOUR = (74, 46, 40), (255, 224, 102), (232, 89, 12)
+# Distance of the cavity's floor below the organ [m], its radius in sizes of the organ, its height over its radius, and
+# its mesh.
+GROUND_GAP, CAVITY_REACH, CAVITY_RISE, RINGS, SPOKES = 0.002, 2.5, 1.0, 40, 96
 # Distance of the page's camera in distances of the overview camera, and its sideways shift in half picture heights.
 FARTHER, ASIDE = 1.5, 0.42
 # Ambient intensity in plain light.
@@ -44,33 +48,26 @@ AMBIENT = 0.9
 # In the page's decimetres; HANDLE_SHARE limits the handle to a share of the organ.
 HANDLE_SIZE, HANDLE_SHARE, BALL_RADIUS = 0.35, 0.45, 0.03
 SHAFT_RADIUS, HEAD_RADIUS, HEAD_LENGTH = 0.012, 0.035, 0.07
+# Thickness of an aim's ring over its radius.
+RING_SHARE, AIM_COLOUR = 0.06, (255, 255, 255)
 # Length of a force arrow per newton: share of the organ's size, at most [m/N]; no arrow below the last value [N].
 FORCE_SHARE, FORCE_LENGTH, FORCE_LEAST = 0.4, 0.06, 0.005
 
 # Presses shallower than this share of the scene's press depth are ignored: they hardly depend on deeper tissue.
 DEPTH_SHARE = 0.35
 # Standard deviation of a touch's Gaussian weight, in contact radii sqrt(R d), and its cut-off in deviations.
-WIDTH, REACH = 0.55, 2.0
+WIDTH, REACH = 0.55, 3.0
 # Least sum of weights of a felt node.
-WEIGHT_LEAST = 0.5
+WEIGHT_TINY, WEIGHT_LEAST, WEIGHT_MOST = 1e-3, 0.5, 1e6
 ORGAN_COLOUR, LESION_COLOUR = (158, 58, 50), (250, 214, 120)
-# Contrast of the first and the last colour, relative to the lower quartile of the map; colours from soft to stiff.
+# Contrast of the first and the last colour, relative to the lower quartile of the map; number of colours.
 CONTRASTS = (0.75, 2.25)
-COLOURS = (
-    (45, 67, 148),
-    (42, 120, 173),
-    (49, 168, 160),
-    (116, 198, 118),
-    (205, 216, 85),
-    (248, 184, 62),
-    (240, 117, 48),
-    (205, 46, 46),
-)
+LEVELS = 16
+TINY = 1e-9
 # Kinds of paint, beside the names of fields.
 STIFFNESS_MAP, NOTHING = "map", ""
 # Offset of the paint above the surface [m].
 PAINT_ABOVE = 0.0004
-NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
 def page_camera(anatomy: Anatomy) -> Camera:
@@ -102,15 +99,16 @@ class Surroundings:
         level = ahead - (ahead @ camera.up) * camera.up
         self.directions = np.stack([right, level / np.linalg.norm(level), -anatomy.face.approach])
         self._scene = viser.scene
-        self._ground = _add_ground(viser.scene, anatomy.mesh.points, camera.up, right)
+        self._cavity = _add_cavity(viser.scene, anatomy.mesh.points, camera.up, right)
+        viser.scene.set_background_image(_backdrop())
         self.show_plain(False)
 
     def show_plain(self, on: bool) -> None:
-        """Turn the greatest costs of a software renderer off or on: shadows, reflections, a glossy ground."""
+        """Turn the greatest costs of a software renderer off or on: shadows, reflections, a glossy cavity."""
         self._scene.configure_default_lights(enabled=True, cast_shadow=not on)
         self._scene.configure_environment_map(None if on else "warehouse", environment_intensity=0.6)
         self._scene.add_light_ambient("/ambient", intensity=AMBIENT if on else 0.0)
-        self._ground.material = "toon3" if on else "standard"
+        self._cavity.material = "toon3" if on else "standard"
 
 
 class FeltMap:
@@ -122,7 +120,7 @@ class FeltMap:
     Fields:
         nodes: indices of the surface nodes                                      (n_surface,)
         contrast: the ratio; 0 without touches                                   (n_surface,)
-        felt: mask of nodes with enough weight of touches                        (n_surface,)
+        weight: of the touches, up to WEIGHT_MOST; a node is felt from WEIGHT_LEAST (n_surface,)
         version: increases with each change
     """
 
@@ -142,7 +140,7 @@ class FeltMap:
 
     def clear(self) -> None:
         """Delete all touches."""
-        self._product, self._square, self._weight = np.zeros((3, len(self.nodes)))
+        self._product, self._square, self.weight = np.zeros((3, len(self.nodes)))
         self.version += 1
 
     def feel(self, tip: FloatArray, depth: float, force: float) -> None:
@@ -160,13 +158,13 @@ class FeltMap:
         healthy = self._indenter.force(depth)
         self._product[near] += weight * force * healthy
         self._square[near] += weight * healthy**2
-        self._weight[near] = np.minimum(self._weight[near] + weight, 1e6)
+        self.weight[near] = np.minimum(self.weight[near] + weight, WEIGHT_MOST)
         self.version += 1
 
     @property
     def felt(self) -> np.ndarray:
         """Mask of felt nodes, (n_surface,)."""
-        return self._weight >= WEIGHT_LEAST
+        return self.weight >= WEIGHT_LEAST
 
     @property
     def contrast(self) -> FloatArray:
@@ -186,10 +184,10 @@ class OrganView:
         self._scene, self._mesh, self._points = scene, anatomy.mesh, anatomy.mesh.points
         self._surface = organ_surface(anatomy)
         self._shown = anatomy.mesh.points
-        vertices, _ = self._surface.follow(self._shown)
+        vertices, _ = self._rest = self._surface.follow(self._shown)
         faces = self._surface.faces.astype(np.uint32)
         self._organ = scene.add_mesh_simple("/organ", _scaled(vertices), faces, color=ORGAN_COLOUR, opacity=None)
-        self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(COLOURS)]
+        self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(_level_colours())]
         self._painted, self._fresh = -1, 1
         self.paints = STIFFNESS_MAP
         self._lesions: list[tuple[Any, Any]] = []
@@ -202,43 +200,73 @@ class OrganView:
         vertices, normals = self._surface.follow(node_position)
         self._organ.vertices = _scaled(vertices)
         if self.paints:
-            above = _scaled(vertices + PAINT_ABOVE * normals)
+            above = (vertices + PAINT_ABOVE * normals) * SCALE
             for paint in self._paint:
                 paint.follow(above)
         for ball, node in self._lesions:
             node.position = ball.centre_now(self._points, node_position) * SCALE
+
+    def on_drag(self, moved: Callable[..., None]) -> None:
+        """Call `moved` with the phase of a drag, the eye and the pointer [m], and True while shift is held."""
+        _listen(self._organ, moved)
+
+    def hit(self, eye: FloatArray, pointer: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Place [m] and outward normal of the surface at rest, seen from an eye behind a pointer [m]; None beside it.
+
+        Intersection of a ray with triangles: Moeller & Trumbore 1997.
+        """
+        vertices, normals = self._rest
+        faces, way = self._surface.faces, (pointer - eye) / np.linalg.norm(pointer - eye)
+        corner, first, second = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+        first, second, from_corner = first - corner, second - corner, eye - corner
+        across = np.cross(way, second)
+        scale = (first * across).sum(axis=1)
+        # The front alone: a ray against the outward normal has a positive determinant.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = (from_corner * across).sum(axis=1) / scale
+            turned = np.cross(from_corner, first)
+            v = turned @ way / scale
+            distance = (second * turned).sum(axis=1) / scale
+            met = (scale > 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
+        if not met.any():
+            return None
+        face = int(np.flatnonzero(met)[np.argmin(distance[met])])
+        outward = np.array([1.0 - u[face] - v[face], u[face], v[face]]) @ normals[faces[face]]
+        return eye + distance[face] * way, outward / np.linalg.norm(outward)
 
     def paint(self, felt: FeltMap) -> None:
         """Update the colours of the stiffness map; the softest part is blue."""
         if self.paints != STIFFNESS_MAP or felt.version == self._painted:
             return
         self._painted = felt.version
-        value = np.full(len(self._points), np.nan)
-        known = felt.felt
-        value[felt.nodes[known]] = felt.contrast[known]
-        vertex = self._surface.interpolate(np.nan_to_num(value))
-        vertex[self._surface.interpolate(np.isnan(value).astype(np.float64)) > 1e-9] = np.nan
-        face = vertex[self._surface.faces].mean(axis=1)
-        self._cover(colour_levels(face))
+        shares, unfelt = np.zeros((2, len(self._points)))
+        shares[felt.nodes] = contrast_shares(felt)
+        # Weights are Gaussian: their logarithm is smooth.
+        unfelt[felt.nodes] = -np.log(np.maximum(felt.weight, WEIGHT_TINY) / WEIGHT_LEAST)
+        mix, faces = clip_triangles(self._surface.faces, self._surface.interpolate(unfelt))
+        self._cover(mix @ self._surface.interpolate(shares), faces, mix)
 
     def paint_field(self, shares: FloatArray) -> None:
         """Update the colours of a field from the places of the nodes on its scale, 0 to 1, (n_node,)."""
-        face = self._surface.interpolate(shares)[self._surface.faces].mean(axis=1)
-        self._cover(np.minimum((face * len(COLOURS)).astype(np.int64), len(COLOURS) - 1))
+        self._cover(np.minimum(self._surface.interpolate(shares), 1.0 - 2.0 * TINY), self._surface.faces)
 
     def show_paint(self, kind: str) -> None:
         """Show STIFFNESS_MAP, NOTHING or a field by its name, which `paint` or `paint_field` then colour."""
         self.paints, self._painted = kind, -1
-        for paint, colour in zip(self._paint, paint_colours(kind), strict=True):
-            paint.colour = colour
-            paint.cover(NO_FACES)
-            paint.follow(np.zeros((0, 3), dtype=np.float32))
+        for paint in self._paint:
+            paint.cover(csr_array((0, 0)), np.zeros((0, 3)))
+            paint.follow(np.zeros((0, 3)))
 
-    def _cover(self, level: np.ndarray) -> None:
-        """Paint each triangle in the colour of its level, from 0; -1 for none, (n_face,)."""
+    def _cover(self, shares: FloatArray, faces: IntArray, mix: csr_array | None = None) -> None:
+        """Paint triangles by the places of their vertices on the scale, 0 to below 1, (n,); `mix` of the surface's."""
         self._fresh = 1
-        for index, paint in enumerate(self._paint):
-            paint.cover(self._surface.faces[level == index])
+        least, most = shares[faces].min(axis=1), shares[faces].max(axis=1)
+        for level, paint in enumerate(self._paint):
+            # The part between two isolines; a triangle on the lower one belongs to it.
+            low, high = level / LEVELS - TINY, (level + 1) / LEVELS - TINY
+            above, part = clip_triangles(faces[(most >= low) & (least < high)], low - shares)
+            below, part = clip_triangles(part, above @ shares - high)
+            paint.cover(below @ above if mix is None else below @ above @ mix, part)
 
     def show_lesions(self, lesions: Sequence[Lesion]) -> None:
         """Show lesions inside a translucent organ; an empty list makes it opaque."""
@@ -259,50 +287,43 @@ class OrganView:
 
 
 class _Paint:
-    """The part of the surface in one colour."""
+    """A band of the surface in one colour."""
 
     def __init__(self, scene: Any, name: str, colour: tuple[int, int, int]) -> None:
-        self._scene, self._name, self.colour = scene, name, colour
-        self._used = np.zeros(0, dtype=np.int64)
+        self._scene, self._name, self._colour = scene, name, colour
         self._node: Any = None
-        self._local = None
+        self._mix, self._faces = csr_array((0, 0)), np.zeros((0, 3), dtype=np.uint32)
+        self._fresh = False
 
-    def cover(self, faces: np.ndarray) -> None:
-        self._used, local = np.unique(faces, return_inverse=True)
-        self._local: np.ndarray | None = local.reshape(-1, 3).astype(np.uint32)
+    def cover(self, mix: csr_array, faces: IntArray) -> None:
+        self._mix, self._faces, self._fresh = mix, faces.astype(np.uint32), True
 
-    def follow(self, vertices: np.ndarray) -> None:
+    def follow(self, vertices: FloatArray) -> None:
+        covers = bool(len(self._faces))
+        moved = (self._mix @ vertices).astype(np.float32) if covers else np.zeros((0, 3), dtype=np.float32)
         if self._node is None:
-            if len(self._used):
+            if covers:
                 self._node = self._scene.add_mesh_simple(
-                    self._name, vertices[self._used], self._local, color=self.colour, cast_shadow=False
+                    self._name, moved, self._faces, color=self._colour, cast_shadow=False
                 )
-                self._local = None
-            return
-        if self._local is not None:
-            self._node.visible, self._node.color = bool(len(self._used)), self.colour
-        if not len(self._used):
-            return
-        self._node.vertices = vertices[self._used]
-        if self._local is not None:
-            self._node.faces, self._local = self._local, None
+        elif covers or self._fresh:
+            self._node.visible = covers
+            if covers:
+                self._node.vertices = moved
+                if self._fresh:
+                    self._node.faces = self._faces
+        self._fresh = False
 
 
-def paint_colours(kind: str) -> Sequence[tuple[int, int, int]]:
-    """Colours of a kind of paint, from low to high."""
-    return COLOURS if kind in (STIFFNESS_MAP, NOTHING) else [tuple(row) for row in field_colours(len(COLOURS)).tolist()]
+def _level_colours() -> list[tuple[int, int, int]]:
+    return [tuple(row) for row in field_colours(LEVELS).tolist()]
 
 
-def colour_levels(contrast: FloatArray) -> np.ndarray:
-    """Index into COLOURS of each contrast, relative to the lower quartile of all; -1 for NaN."""
-    level = np.full(len(contrast), -1)
-    known = np.isfinite(contrast)
-    if known.any():
-        low, high = CONTRASTS
-        reference = np.quantile(contrast[known], 0.25)
-        share = (contrast[known] / max(reference, 1e-12) - low) / (high - low)
-        level[known] = np.clip((share * len(COLOURS)).astype(np.int64), 0, len(COLOURS) - 1)
-    return level
+def contrast_shares(felt: FeltMap) -> FloatArray:
+    """Place of each surface node on the map's scale, 0 to below 1, relative to the lower quartile of what was felt."""
+    low, high = CONTRASTS
+    reference = np.quantile(felt.contrast[felt.felt], 0.25) if felt.felt.any() else 1.0
+    return np.clip((felt.contrast / max(reference, 1e-12) - low) / (high - low), 0.0, 1.0 - 2.0 * TINY)
 
 
 def _scaled(vertices: FloatArray) -> np.ndarray:
@@ -346,18 +367,20 @@ class InstrumentView:
         self._shown = now if self._shown is None else np.where(moved[:, None], now, self._shown)
         return moved
 
-    def on_drag(self, moved: Callable[[int, str, FloatArray], None]) -> None:
-        """Call `moved` with an arm, the phase of a drag and the pointer's position [m]."""
+    def on_drag(self, moved: Callable[..., None]) -> None:
+        """Call `moved` as `OrganView.on_drag` does, with the arm before."""
         for node, arm in zip(self.nodes, self.arms, strict=True):
             if arm is not None:
-                node.on_drag("left")(_caller(moved, arm))
+                _listen(node, partial(moved, arm))
 
 
-def _caller(moved: Callable[[int, str, FloatArray], None], arm: int) -> Callable[[Any], Any]:
+def _listen(node: Any, moved: Callable[..., None]) -> None:
     async def call(event: Any) -> None:
-        moved(arm, event.phase, np.asarray(event.end_position, dtype=np.float64) / SCALE)
+        eye, pointer = (np.asarray(at, np.float64) / SCALE for at in (event.client.camera.position, event.end_position))
+        moved(event.phase, eye, pointer, event.modifier == "shift")
 
-    return call
+    for modifier in (None, "shift"):
+        node.on_drag("left", modifier=modifier)(call)
 
 
 def _add(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> Any:
@@ -455,25 +478,73 @@ class ForceArrow:
             return
         self._shows = True
         length = self._length * size * SCALE
-        up = force / size
-        across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
-        across /= np.linalg.norm(across)
-        turn = np.stack([across, np.cross(up, across), up])
         points = np.concatenate([self._shaft * [1.0, 1.0, length], self._head + np.array([0.0, 0.0, length])])
-        self._node.vertices = (points @ turn + tip * SCALE).astype(np.float32)
+        self._node.vertices = (points @ _turn_to(force / size) + tip * SCALE).astype(np.float32)
 
 
-def _add_ground(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> Any:
+class Aim:
+    """A ring on the surface under a tip, and a line from the ring to the tip: where a press would touch."""
+
+    def __init__(self, scene: Any, arm: int, radius: float) -> None:
+        """Add it for a tip's ball of a radius [m], without extent."""
+        import trimesh
+
+        ring = trimesh.creation.torus(radius * SCALE, RING_SHARE * radius * SCALE, 32, 8)
+        line = trimesh.creation.cylinder(radius=0.5 * RING_SHARE * radius * SCALE, height=1.0, sections=8)
+        line.apply_translation([0.0, 0.0, 0.5])
+        self._radius, self._ring, self._line = radius, np.array(ring.vertices), np.array(line.vertices)
+        faces = np.concatenate([ring.faces, line.faces + len(ring.vertices)]).astype(np.uint32)
+        hidden = np.zeros((len(self._ring) + len(self._line), 3), dtype=np.float32)
+        self._node = scene.add_mesh_simple(f"/aim/{arm}", hidden, faces, color=AIM_COLOUR, cast_shadow=False)
+        self._shown = np.full(3, np.inf)
+
+    def follow(self, tip: FloatArray, place: FloatArray, outward: FloatArray) -> None:
+        """Draw it at a place of the surface [m] with its normal, under a tip [m], each (3,)."""
+        if np.abs(tip - self._shown).max() < STILL:
+            return
+        self._shown = tip
+        gap = max(0.0, float((tip - place) @ outward) - self._radius) * SCALE
+        points = np.concatenate([self._ring, self._line * [1.0, 1.0, gap]]) @ _turn_to(outward)
+        self._node.vertices = (points + (place + RING_SHARE * self._radius * outward) * SCALE).astype(np.float32)
+
+
+def _turn_to(way: FloatArray) -> FloatArray:
+    """Rotation of row vectors that turns the z axis to a unit vector, (3, 3)."""
+    across = np.cross(way, [1.0, 0.0, 0.0] if abs(way[0]) < 0.9 else [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(way, across), way])
+
+
+def _add_cavity(scene: Any, points: FloatArray, up: FloatArray, right: FloatArray) -> Any:
+    """A bowl of fat around the organ, with folds."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     low = float((points @ up).min()) - GROUND_GAP
-    ground = middle + up * (low - middle @ up)
-    half = GROUND_REACH * float(np.ptp(points, axis=0).max())
-    along = np.cross(up, right)
-    corners = [ground + half * (x * right + y * along) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    reach = CAVITY_REACH * float(np.ptp(points, axis=0).max())
+    radius, angle = np.meshgrid(np.linspace(0.0, 1.0, RINGS), np.linspace(0.0, 2.0 * math.pi, SPOKES + 1)[:-1])
+    waves = ((3, 4.0), (5, -9.0), (8, 14.0), (13, 23.0))
+    fold = sum(np.sin(count * angle + turn * radius + count) / count for count, turn in waves)
+    # Flat under the organ.
+    height = CAVITY_RISE * np.maximum(0.0, radius - 0.25) ** 2 * (1.0 + 0.4 * fold)
+    across, along = radius * np.cos(angle), radius * np.sin(angle)
+    axes = np.stack([right, np.cross(up, right), up])
+    vertices = (
+        reach * np.stack([across, along, height], axis=2).reshape(-1, 3) @ axes + middle + up * (low - middle @ up)
+    )
+    ring, spoke = np.meshgrid(np.arange(RINGS - 1), np.arange(SPOKES))
+    here, there = RINGS * spoke + ring, RINGS * ((spoke + 1) % SPOKES) + ring
+    faces = np.stack([here, here + 1, there + 1, here, there + 1, there], axis=2).reshape(-1, 3)
     return scene.add_mesh_simple(
-        "/ground",
-        (np.array(corners) * SCALE).astype(np.float32),
-        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
-        color=GROUND_COLOUR,
+        "/cavity",
+        (vertices * SCALE).astype(np.float32),
+        faces.astype(np.uint32),
+        color=FAT_COLOUR,
+        side="double",
         cast_shadow=False,
     )
+
+
+def _backdrop() -> NDArray[np.uint8]:
+    """Dark red, lighter in the middle, as light falls off in a body."""
+    y, x = np.mgrid[-1.0:1.0:90j, -1.0:1.0:160j]
+    fall = np.exp(-1.5 * (x**2 + y**2))[:, :, None]
+    return np.rint(np.array([18, 8, 9]) + fall * np.array([70, 24, 22])).astype(np.uint8)

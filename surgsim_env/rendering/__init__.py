@@ -10,7 +10,7 @@ from surgsim_env.rendering.painted_fields import COLOUR_MAP, PAINTED_FIELDS, Pai
 from surgsim_env.rendering.renderer import DrawnCapsule, OrganRenderer, draw_still
 from surgsim_env.rendering.scene_model import geom_colour, is_support, mesh_rows, shown_geoms
 from surgsim_env.rendering.surface import BEND, smooth_normals
-from surgsim_env.rendering.tissue import cut_edges, lesion_ball
+from surgsim_env.rendering.tissue import clip_triangles, cut_edges, lesion_ball
 
 __all__ = [
     "BEND",
@@ -24,6 +24,7 @@ __all__ = [
     "OrganRenderer",
     "PaintedField",
     "RenderOptions",
+    "clip_triangles",
     "cut_edges",
     "draw_look",
     "draw_still",

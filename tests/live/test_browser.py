@@ -70,7 +70,7 @@ def opened(browser, page) -> None:
     """The page is there, its physics runs, and pictures come."""
     browser.open(page.server.address)
     browser.wait_for("!!document.body && document.body.innerText.includes('Force and depth')")
-    browser.wait_for("document.body.innerText.includes('steps/s')")
+    browser.wait_for("document.querySelector('#surgsim .number')?.innerText.includes('N')")
     made = page.pictures
     browser.wait_until(lambda: page.pictures > made + 3)
     browser.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
@@ -88,18 +88,20 @@ def seen_at(browser, page, place) -> tuple[float, float]:
     return box[0] + float(at[0, 0]), box[1] + float(at[0, 1])
 
 
-def drag_into_the_organ(browser, page) -> None:
-    """Drag the handle of the only tip down until the organ presses back."""
-    session = page.session
-    start = session.targets[0]
-    grip = start + 0.02 * session.directions[2]
-    down = grip - 0.030 * session.directions[2]
-    there = seen_at(browser, page, grip), seen_at(browser, page, down)
-    browser.drag(*there, lambda: np.linalg.norm(session.targets[0] - start) > 0.015)
+@contextlib.contextmanager
+def pressing(browser, page, place) -> Iterator[None]:
+    """The pointer is held on a place of the organ [m] until it presses back; let go at the end."""
+    session, at = page.session, seen_at(browser, page, place)
+    browser.mouse("mouseMoved", *at)
+    browser.next_frame()
+    browser.mouse("mousePressed", *at, 1)
     browser.wait_until(lambda: np.linalg.norm(session.frame()["force"][0]) > 0.05)
+    yield
+    browser.mouse("mouseReleased", *at)
+    browser.wait_until(lambda: not session.frame()["force"][0].any())
 
 
-def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium):
+def test_the_page_opens_and_a_pointer_presses_the_organ(served, chromium):
     session = served.session
     with chromium.page(WIDTH, HEIGHT) as browser:
         opened(browser, served)
@@ -113,10 +115,10 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         rest = session.frame()["node"].copy()
         plot_before = browser.run(PLOT)
 
-        drag_into_the_organ(browser, served)
-        # The tip is still on its way.
-        browser.wait_until(lambda: np.linalg.norm(session.frame()["node"] - rest, axis=1).max() > 0.001)
-        browser.wait_until(lambda: browser.run(PLOT) != plot_before)
+        with pressing(browser, served, middle_of(session.anatomy)):
+            browser.wait_until(lambda: np.linalg.norm(session.frame()["node"] - rest, axis=1).max() > 0.001)
+            browser.wait_until(lambda: browser.run(PLOT) != plot_before)
+            browser.wait_until(lambda: shown_force(browser) > 0.05)
         box = browser.run(f"(() => {{ const r = {CANVAS}; return [r.x, r.y, r.width, r.height]; }})()")
         middle = (slice(int(0.2 * box[3]), int(0.9 * box[3])), slice(int(0.25 * box[2]), int(0.6 * box[2])))
 
@@ -130,11 +132,52 @@ def test_the_page_opens_and_its_probe_is_dragged_into_the_organ(served, chromium
         red = after[is_red(after)]
         assert len(red) > 2000 and len(np.unique(red, axis=0)) > 50
 
+        # A page that is loaded again has the curve of before.
+        browser.open(served.server.address)
+        opened(browser, served)
+        browser.wait_until(lambda: browser.run(CURVE) > 50)
         browser.click_on("Pause")
         browser.wait_until(lambda: session.frame()["phase"] == Phase.PAUSED)
         browser.wait_for("document.body.innerText.includes('Continue')")
         # viser's camera complains of its own way to hear the wheel.
         assert [complaint for complaint in browser.complaints() if "passive event listener" not in complaint] == []
+
+
+def middle_of(anatomy) -> np.ndarray:
+    """Middle of the palpable face [m]."""
+    return anatomy.face.project(anatomy.face.points[anatomy.face.triangles].mean(axis=(0, 1)))[0]
+
+
+def shown_force(browser) -> float:
+    """The number over the picture [N]."""
+    return float(browser.run("document.querySelector('#surgsim .number').innerText").split()[0])
+
+
+def test_a_hidden_lesion_is_found_with_the_pointer_alone(served, chromium):
+    """From the page's load to the score: a newcomer presses the button, a row of places, and the stiffest again."""
+    session, search = served.session, served.search
+    with chromium.page(WIDTH, HEIGHT) as browser:
+        opened(browser, served)
+        organ = int(session.frame()["organ"])
+        browser.click_on("Find the hidden lesion")
+        browser.wait_until(lambda: int(session.frame()["organ"]) > organ)
+        browser.wait_for("document.body.innerText.includes('0 presses')")
+        middle, across, along = middle_of(session.anatomy), *session.directions[:2]
+        places = [middle + 0.011 * (x * across + y * along) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+        forces = []
+        for place in places:
+            with pressing(browser, served, place):
+                steps = session.timing()[0]["steps"]
+                browser.wait_until(lambda steps=steps: session.timing()[0]["steps"] > steps + 300)
+                forces.append(shown_force(browser))
+        with pressing(browser, served, places[int(np.argmax(forces))]):
+            pass
+        browser.click_on("It is where I pressed last")
+        browser.wait_for("document.body.innerText.includes('points of 100')")
+        assert search.guess.presses == 10 and search.guess.error < 0.010
+        assert f"{search.guess.points} points" in browser.text()
+        browser.click_on("Find another")
+        browser.wait_for("document.body.innerText.includes('0 presses')")
 
 
 def is_red(shot: np.ndarray) -> np.ndarray:
@@ -212,6 +255,13 @@ PLAIN_LIGHT = """(() => {
   const label = [...document.querySelectorAll('label')].find(one => one.innerText == 'Plain light');
   return label && document.getElementById(label.htmlFor).checked; })()"""
 SMOOTH_EDGES = "document.querySelector('canvas[data-engine]').getContext('webgl2').getContextAttributes().antialias"
+# Columns of the first plot with a pixel of the curve's colour.
+CURVE = """(() => {
+  const one = document.querySelector('.uplot canvas');
+  const d = one.getContext('2d').getImageData(0, 0, one.width, one.height).data, columns = new Set();
+  for (let i = 0; i < d.length; i += 4)
+    if (d[i] > 200 && d[i + 1] > 60 && d[i + 1] < 120 && d[i + 2] < 60) columns.add((i / 4) % one.width);
+  return columns.size; })()"""
 # The plots' own canvases, as one number.
 PLOT = """[...document.querySelectorAll('.uplot canvas')].map(one => {
   const d = one.getContext('2d').getImageData(0, 0, one.width, one.height).data;

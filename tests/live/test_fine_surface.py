@@ -1,13 +1,13 @@
 """The page's organ with a scan's own surface: what is sent to a browser, and the paint on it. No browser is needed."""
 
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from surgsim_apps.live.stage import NOTHING, SCALE, FeltMap, OrganView, paint_colours
+from surgsim_apps.live.stage import LEVELS, NOTHING, PAINT_ABOVE, SCALE, FeltMap, OrganView
 from surgsim_env.rendering.embedding import EmbeddedSurface, organ_surface
+from surgsim_env.rendering.painted_fields import field_colours
 from surgsim_env.scene.anatomy import load_anatomy
 
 
@@ -20,6 +20,11 @@ class Sent:
     def add_mesh_simple(self, name, vertices, faces, **look):
         self.meshes[name] = SimpleNamespace(vertices=vertices, faces=faces, visible=True, **look)
         return self.meshes[name]
+
+
+def area(mesh) -> float:
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +48,19 @@ def test_its_vertices_are_sent_and_follow_the_nodes(anatomy, view):
     np.testing.assert_allclose(sent.meshes["/organ"].vertices, SCALE * surface.follow(pushed)[0], rtol=0, atol=1e-6)
 
 
+def test_a_pointer_meets_the_nearest_front_of_it(anatomy, view):
+    organ, _ = view
+    low, high = anatomy.mesh.points.min(axis=0), anatomy.mesh.points.max(axis=0)
+    middle, above = 0.5 * (low + high), np.array([0.003, 0.002, 0.2])
+    place, outward = organ.hit(middle + above, middle)
+    assert place[2] == pytest.approx(high[2], abs=1e-6) and outward @ [0.0, 0.0, 1.0] > 0.99
+    # On the line of sight, and regardless of the distance of the pointer's plane.
+    assert np.linalg.norm(np.cross(place - middle, above / np.linalg.norm(above))) < 1e-9
+    np.testing.assert_allclose(organ.hit(middle + above, middle + 0.5 * above)[0], place, atol=1e-9)
+    assert organ.hit(middle + above, middle + above + [0.0, 0.0, 1.0]) is None
+    assert organ.hit(middle + above, high + np.array([0.05, 0.0, 0.0])) is None
+
+
 def test_touches_paint_it_where_they_were_felt_and_nowhere_else(anatomy, view):
     organ, sent = view
     felt, scene = FeltMap(anatomy), anatomy.scene
@@ -59,10 +77,10 @@ def test_touches_paint_it_where_they_were_felt_and_nowhere_else(anatomy, view):
     organ.follow(anatomy.mesh.points)
     painted = np.concatenate([mesh.vertices for name, mesh in sent.meshes.items() if name.startswith("/felt")]) / SCALE
     assert len(painted)
-    # A vertex is painted only where all corners of its triangle were felt.
-    nodes = anatomy.mesh.points[felt.nodes[felt.felt]]
-    reach = np.linalg.norm(nodes - top, axis=1).max()
-    assert np.linalg.norm(painted - top, axis=1).max() < reach + 0.001
+    # The map ends between the outermost node that was felt and its neighbours.
+    away = np.linalg.norm(painted - top, axis=1).max()
+    nodes = np.linalg.norm(anatomy.mesh.points[felt.nodes[felt.felt]] - top, axis=1).max()
+    assert nodes - 0.001 < away < nodes + anatomy.palpable_cell
 
 
 def test_a_field_covers_the_whole_organ_in_the_colours_of_its_values(anatomy, view):
@@ -72,10 +90,15 @@ def test_a_field_covers_the_whole_organ_in_the_colours_of_its_values(anatomy, vi
     organ.paint_field((height - height.min()) / np.ptp(height))
     organ.follow(anatomy.mesh.points)
     painted = [mesh for name, mesh in sent.meshes.items() if name.startswith("/felt")]
-    assert sum(len(mesh.faces) for mesh in painted) == len(sent.meshes["/organ"].faces)
-    middles = [(mesh.color, mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)) for mesh in painted]
-    colours = paint_colours("stress")
-    for (low_colour, low), (high_colour, high) in itertools.pairwise(sorted(middles, key=lambda row: row[1].mean())):
-        assert low.max() < high.min() + 1e-6 and colours.index(low_colour) < colours.index(high_colour)
+    # Slightly above the organ.
+    assert 1.0 <= sum(area(mesh) for mesh in painted) / area(sent.meshes["/organ"]) < 1.05
+    # Each band lies between two isolines of the height.
+    step, low = SCALE * np.ptp(height) / LEVELS, SCALE * height.min()
+    colours = [tuple(row) for row in field_colours(LEVELS).tolist()]
+    for mesh in painted:
+        level = colours.index(mesh.color)
+        inside = mesh.vertices[:, 2] - low - step * level
+        above = 1.01 * SCALE * PAINT_ABOVE
+        assert inside.min() > -above and inside.max() < step + above
     organ.show_paint(NOTHING)
     assert not any(mesh.visible for mesh in painted)

@@ -147,6 +147,14 @@ def test_the_paint_is_chosen_by_its_title_and_has_the_end_of_its_scale():
     assert legend.visible and gui.elements["Clear"].visible
 
 
+def test_the_pointer_presses_as_deep_as_the_slider_says():
+    scene = make_scene("phantom_small")
+    panel, gui, _ = made(scene)
+    assert panel.press_depth == pytest.approx(scene.palpation.press_depth)
+    gui.elements["Press depth [mm]"].set(2.5)
+    assert panel.press_depth == pytest.approx(0.0025)
+
+
 def test_only_what_there_is_can_be_switched():
     for scene in (make_scene("phantom_small"), with_motion(make_scene("phantom_small"), "calm")):
         for has_jaw in (False, True):
@@ -170,8 +178,9 @@ def test_buttons_are_named_by_what_a_click_does():
     assert gui.elements["Close the jaw"].value and gui.elements["Hold the breath"].value
     panel.show_phase(frame, 0.0, jaw_closed=False, breath_held=False)
     assert not gui.elements["Close the jaw"].value
-    panel.show_status(frame, [("force", "0.25 N")])
-    assert "recording" in gui.texts[0].content and "0.25 N" in gui.texts[0].content
+    panel.show_status(frame, [("physics", "1000 steps/s"), ("", "written")])
+    first, timing = gui.texts[0].content, next(text.content for text in gui.texts if "steps/s" in text.content)
+    assert "recording" in first and "written" in first and "steps/s" not in first and "written" not in timing
     panel.show_plain(True)
     assert gui.elements["Plain light"].value
 
@@ -184,7 +193,7 @@ def test_plots_show_the_last_seconds_of_each_arm():
     trace["depth"][:, 0] = 0.001
     panel.plot(trace)
     time, left, right = gui.plots["N"].data
-    assert time[-1] - time[0] == pytest.approx(PLOTTED, abs=0.1)
+    assert time[0] == pytest.approx(-PLOTTED, abs=0.1) and time[-1] == pytest.approx(0.0, abs=0.1)
     assert np.allclose(left, 0.3) and np.allclose(right, 0.7)
     assert gui.plots["N"].scales["y"]["max"] == 2.0 * PLOT_LEAST["N"]
     assert np.allclose(gui.plots["mm"].data[1], 1.0) and gui.plots["mm"].scales["y"]["max"] == PLOT_LEAST["mm"]

@@ -27,7 +27,7 @@ from surgsim_apps.live.organ_choice import (
 )
 from surgsim_apps.live.painted_tissue import PaintedTissue
 from surgsim_apps.live.physics import Physics
-from surgsim_apps.live.stage import COLOURS, FeltMap, colour_levels
+from surgsim_apps.live.stage import FeltMap, contrast_shares
 from surgsim_env.coupling.simulation import Simulation
 from surgsim_env.rendering.painted_fields import PAINTED_FIELDS
 from surgsim_env.rendering.scene_model import shown_geoms
@@ -266,7 +266,7 @@ def test_the_map_is_stiff_where_touches_were():
 
 
 def test_colours_go_from_soft_to_stiff():
-    levels = colour_levels(np.array([np.nan, 1.0, 1.0, 1.0, 1.5, 9.0]))
-    assert levels[0] == -1 and levels[5] == len(COLOURS) - 1
-    assert levels[1] < levels[4] < levels[5]
-    assert (colour_levels(np.full(3, np.nan)) == -1).all()
+    felt = SimpleNamespace(contrast=np.array([0.0, 1.0, 1.0, 1.0, 1.5, 9.0]), felt=np.arange(6) > 0)
+    shares = contrast_shares(felt)
+    assert shares[0] == 0.0 < shares[1] < shares[4] < shares[5] < 1.0 and shares[5] > 0.999
+    assert not contrast_shares(SimpleNamespace(contrast=np.zeros(3), felt=np.zeros(3, dtype=bool))).any()

@@ -1,0 +1,57 @@
+// Over the picture: force as a number and a bar, the search for a hidden lesion, how to steer; and a press from a click.
+(() => {
+  "use strict";
+  const AMBER = "#f59f00", RED = "#fa5252", CALM = "#e9ecef";
+  const style = `
+    #surgsim { position: fixed; top: 14px; left: 16px; z-index: 5; color: ${CALM}; font-family: system-ui, sans-serif;
+      text-shadow: 0 1px 3px #000c; pointer-events: none; user-select: none; max-width: calc(100vw - 32px); }
+    #surgsim .number { font-size: 64px; font-weight: 700; line-height: 1; font-variant-numeric: tabular-nums; }
+    #surgsim .number small { font-size: 24px; font-weight: 400; }
+    #surgsim .bar { width: 240px; height: 12px; margin: 8px 0; border-radius: 6px; background: #0008; overflow: hidden; }
+    #surgsim .bar i { display: block; height: 100%; width: 0; border-radius: 6px; }
+    #surgsim .text { font-size: 16px; margin: 8px 0; white-space: pre-line; }
+    #surgsim button { pointer-events: auto; font: 600 16px system-ui, sans-serif; padding: 10px 18px; border: 0;
+      border-radius: 8px; background: #e8590c; color: #fff; cursor: pointer; }
+    #surgsim .steer { opacity: .8; font-size: 14px; margin-top: 10px; max-width: 240px; }`;
+  const root = document.createElement("div");
+  root.id = "surgsim";
+  root.innerHTML = `<style>${style}</style><div class="number"></div><div class="bar"><i></i></div>
+    <div class="text"></div><button hidden></button><div class="steer"></div>`;
+  const part = (name) => root.querySelector(name);
+  addEventListener("DOMContentLoaded", () => document.body.append(root));
+  part("button").onclick = (event) => { window.surgsim.send(event.target.dataset.sends); event.target.blur(); };
+
+  let level = 0, audio = null;
+  const sound = (pitch) => {
+    audio ??= new AudioContext();
+    const tone = new OscillatorNode(audio, { frequency: pitch }), volume = new GainNode(audio, { gain: 0.15 });
+    tone.connect(volume).connect(audio.destination);
+    tone.start();
+    tone.stop(audio.currentTime + 0.12);
+  };
+  window.surgsim.show = (state) => {
+    const force = Math.max(...state.force), now = (force >= state.soft) + (force >= state.hard);
+    const colour = [CALM, AMBER, RED][now];
+    part(".number").innerHTML = `${force.toFixed(2)} <small>N</small>`;
+    part(".number").style.color = colour;
+    part(".bar i").style.background = now ? colour : "#51cf66";
+    part(".bar i").style.width = `${Math.min(100, 100 * force / state.hard)}%`;
+    for (const name of ["text", "steer"]) if (part(`.${name}`).textContent !== state[name]) part(`.${name}`).textContent = state[name];
+    const button = part("button");
+    button.hidden = !state.button;
+    button.textContent = state.button;
+    button.dataset.sends = state.sends;
+    if (state.tone && now > level) sound(now === 1 ? 660 : 990);
+    level = now;
+  };
+
+  // viser sees a drag once the pointer has moved: a press that stays where it is becomes one by a step to and fro.
+  const STEP = 6;
+  addEventListener("pointerdown", (event) => {
+    if (event.target.tagName !== "CANVAS" || event.button !== 0 || !event.isTrusted) return;
+    const { target, pointerId, pointerType, clientX, clientY, shiftKey } = event;
+    for (const step of [STEP, 0])
+      setTimeout(() => target.dispatchEvent(new PointerEvent("pointermove", { pointerId, pointerType, shiftKey,
+        clientX: clientX + step, clientY, buttons: 1, bubbles: true, cancelable: true, isPrimary: true })), 30 - step);
+  }, true);
+})();

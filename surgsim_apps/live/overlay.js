@@ -3,7 +3,7 @@
   "use strict";
   const AMBER = "#f59f00", RED = "#fa5252", CALM = "#e9ecef";
   const style = `
-    #surgsim { position: fixed; top: 14px; left: 16px; z-index: 5; color: ${CALM}; font-family: system-ui, sans-serif;
+    #surgsim { position: fixed; top: 14px; left: 16px; z-index: 1000; color: ${CALM}; font-family: system-ui, sans-serif;
       text-shadow: 0 1px 3px #000c; pointer-events: none; user-select: none; max-width: calc(100vw - 32px); }
     #surgsim .number { font-size: 64px; font-weight: 700; line-height: 1; font-variant-numeric: tabular-nums; }
     #surgsim .number small { font-size: 24px; font-weight: 400; }
@@ -36,11 +36,11 @@
     part(".number").style.color = colour;
     part(".bar i").style.background = now ? colour : "#51cf66";
     part(".bar i").style.width = `${Math.min(100, 100 * force / state.hard)}%`;
-    for (const name of ["text", "steer"]) if (part(`.${name}`).textContent !== state[name]) part(`.${name}`).textContent = state[name];
-    const button = part("button");
-    button.hidden = !state.button;
-    button.textContent = state.button;
-    button.dataset.sends = state.sends;
+    // A text that is replaced under a pressed pointer takes the click with it.
+    for (const [name, text] of [[".text", state.text], [".steer", state.steer], ["button", state.button]])
+      if (part(name).textContent !== text) part(name).textContent = text;
+    part("button").hidden = !state.button;
+    part("button").dataset.sends = state.sends;
     if (state.tone && now > level) sound(now === 1 ? 660 : 990);
     level = now;
   };

@@ -2,15 +2,18 @@
 
 `<!-- environment ID -->` becomes the docstring of that environment (Gymnasium's headings), whose tables of commands,
 channels and rewards come from the task's declaration; its spaces are added. `<!-- commands -->` becomes the help texts
-of `surgsim` and each of its commands, `<!-- fields OrganModel -->` the table of that structure's fields. What stands
+of `surgsim` and each of its commands, `<!-- fields OrganModel -->` the table of that structure's fields,
+`<!-- validation rows -->` the lines of validation.csv, folded by group. What stands
 from there to `<!-- made from the code -->` is for those who read the file itself, and is replaced.
 """
 
 import contextlib
+import csv
 import html
 import io
 import os
 import re
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -30,7 +33,23 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Fill the marks in."""
     markdown = ENVIRONMENT.sub(lambda mark: environment_text(mark[1]), markdown)
     markdown = FIELDS.sub(lambda mark: field_table(mark[1]), markdown)
+    markdown = markdown.replace("<!-- validation rows -->", validation_rows())
     return COMMANDS.sub(lambda mark: command_list(), markdown)
+
+
+def validation_rows() -> str:
+    """The lines of validation.csv, a folded table for each group."""
+    from surgsim_apps.validation.page import grouped, tally
+
+    with (Path(__file__).parents[1] / "validation.csv").open(encoding="utf-8", newline="") as file:
+        lines = list(csv.DictReader(file))
+    parts: list[str] = []
+    for name, own in grouped(lines).items():
+        parts += ["<details markdown>", f"<summary>{name}: {tally(own)}</summary>\n"]
+        parts += [f"| {' | '.join(own[0])} |", "|---|---|---:|---:|---:|---:|---|---|"]
+        parts += [f"| {' | '.join(text.replace('|', '&#124;') for text in line.values())} |" for line in own]
+        parts.append("\n</details>\n")
+    return "\n".join(parts)
 
 
 def environment_text(id: str) -> str:

@@ -1,16 +1,21 @@
 """Parts of pages that are made from the code.
 
 `<!-- environment ID -->` becomes the docstring of that environment (Gymnasium's headings), whose tables of commands,
-channels and rewards come from the task's declaration; its spaces are added. `<!-- commands -->` becomes the help texts
-of `surgsim` and each of its commands, `<!-- fields OrganModel -->` the table of that structure's fields. What stands
+channels and rewards come from the task's declaration; its spaces are added, and channels of options folded.
+`<!-- commands -->` becomes the help texts
+of `surgsim` and each of its commands, `<!-- fields OrganModel -->` the table of that structure's fields,
+`<!-- validation rows -->` the lines of validation.csv, folded by group. What stands
 from there to `<!-- made from the code -->` is for those who read the file itself, and is replaced.
 """
 
 import contextlib
+import csv
 import html
 import io
 import os
 import re
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -22,6 +27,8 @@ from mkdocs.structure.pages import Page
 ENVIRONMENT = re.compile(r"<!-- environment (\S+) -->\n.*?<!-- made from the code -->", re.DOTALL)
 COMMANDS = re.compile(r"<!-- commands -->\n.*?<!-- made from the code -->", re.DOTALL)
 FIELDS = re.compile(r"<!-- fields (\w+) -->\n.*?<!-- made from the code -->", re.DOTALL)
+# Paragraphs on observations of an option.
+OPTION = re.compile(r"With `(?!observe_force)|An instrument with")
 # Wide enough for each option to be on one line.
 COLUMNS = {"COLUMNS": "4000"}
 
@@ -30,7 +37,23 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Fill the marks in."""
     markdown = ENVIRONMENT.sub(lambda mark: environment_text(mark[1]), markdown)
     markdown = FIELDS.sub(lambda mark: field_table(mark[1]), markdown)
+    markdown = markdown.replace("<!-- validation rows -->", validation_rows())
     return COMMANDS.sub(lambda mark: command_list(), markdown)
+
+
+def validation_rows() -> str:
+    """The lines of validation.csv, a folded table for each group."""
+    from surgsim_apps.validation.page import grouped, tally
+
+    with (Path(__file__).parents[1] / "validation.csv").open(encoding="utf-8", newline="") as file:
+        lines = list(csv.DictReader(file))
+    parts: list[str] = []
+    for name, own in grouped(lines).items():
+        parts += ["<details markdown>", f"<summary>{name}: {tally(own)}</summary>\n"]
+        parts += [f"| {' | '.join(own[0])} |", "|---|---|---:|---:|---:|---:|---|---|"]
+        parts += [f"| {' | '.join(text.replace('|', '&#124;') for text in line.values())} |" for line in own]
+        parts.append("\n</details>\n")
+    return "\n".join(parts)
 
 
 def environment_text(id: str) -> str:
@@ -39,6 +62,8 @@ def environment_text(id: str) -> str:
     Raises:
         PluginError: a docstring without one of the headings, or with others; names them.
     """
+    import gymnasium as gym
+
     from surgsim_env.tasks.declaration import HEADINGS, docstring_sections
 
     summary, sections = docstring_sections(environment_class(id).__doc__ or "")
@@ -46,8 +71,10 @@ def environment_text(id: str) -> str:
         raise PluginError(
             f"{id}: the docstring has the headings {', '.join(sections)}; it must have {', '.join(HEADINGS)}"
         )
+    env: Any = gym.make(id)
+    sections["Observation Space"] = options_folded(sections["Observation Space"], env.unwrapped.observation_slices)
     make = f'```python\nimport gymnasium as gym\nimport surgsim_env\n\nenv = gym.make("{id}")\n```'
-    parts = [make, summary_table(id), *(f"## {title}\n\n{_lists_apart(text)}" for title, text in sections.items())]
+    parts = [make, summary_table(env), *(f"## {title}\n\n{_lists_apart(text)}" for title, text in sections.items())]
     return "\n\n".join([summary, *parts])
 
 
@@ -65,11 +92,22 @@ def environment_class(id: str) -> type:
     return creator
 
 
-def summary_table(id: str) -> str:
-    """A table from Gymnasium's registry and the environment."""
-    import gymnasium as gym
+def options_folded(text: str, channels: Mapping[str, slice]) -> str:
+    """The observations of an environment by default; paragraphs and rows of options folded at the end."""
+    blocks = text.split("\n\n")
+    options = [block for block in blocks[1:] if OPTION.match(block)]
+    rows = [row for row in text.split("\n") if (match := re.match(r"\| `(\w+)`", row)) and match[1] not in channels]
+    if not rows:
+        return text
+    head = [row for row in text.split("\n") if row.startswith("| ")][:2]
+    kept = "\n\n".join(block for block in blocks if block not in options)
+    kept = "\n".join(row for row in kept.split("\n") if row not in rows)
+    folded = "\n\n".join([*options, "\n".join([*head, *rows])])
+    return f"{kept}\n\n<details markdown>\n<summary>Channels of options</summary>\n\n{folded}\n\n</details>"
 
-    env: Any = gym.make(id)
+
+def summary_table(env: Any) -> str:
+    """A table from Gymnasium's registry and the environment."""
     inner: Any = env.unwrapped
     observed = env.observation_space
     steps = inner.task.episode_steps

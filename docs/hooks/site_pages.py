@@ -21,7 +21,7 @@ OUTSIDE = {
     "CHANGELOG.md": "changelog.md",
 }
 # Pages of large tables, which commands write.
-WIDE = {"validation.md", "benchmarks.md"}
+WIDE = {"validation_rows.md", "benchmarks.md"}
 
 NAMED = re.compile(r"(?:docs|agents|scenes)/[\w/]+\.md|CONTRIBUTING\.md|CHANGELOG\.md")
 # A span of code, which is a link where it is such a path and nothing else; or a path in plain text, outside of links.

@@ -1,8 +1,7 @@
-"""The report of a benchmark run: figures in sections, their machine, the page."""
+"""The report of a benchmark run: figures in sections, their machine."""
 
 import os
 import platform
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
@@ -11,16 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from msdm_core.kernels import GROUP, lane_counts, register_bits
-from surgsim_apps.reports.output_folder import OutputFolder
 from surgsim_env.coupling import core_count
 from surgsim_env.scene import PHYSICS_VERSION
 
 PACKAGES = ("surgsim", "numpy", "scipy", "numba", "mujoco", "gymnasium", "newton", "warp-lang", "scikit-fem")
-REPORT_NAME = "benchmarks.md"
-INTRODUCTION = """# Benchmarks
-
-Written by `surgsim bench{quick}`. Times hold for this machine and this run; compare the ratios.
-"""
 
 
 class AbsentError(Exception):
@@ -99,12 +92,12 @@ class Section:
     closing: str = ""
 
     def markdown(self) -> str:
-        """Heading, method, and a table: cases down, quantities across, notes last."""
+        """Method, and a table: cases down, quantities across, notes last."""
         cases = list(dict.fromkeys(figure.case for figure in self.figures))
         columns = list(dict.fromkeys((figure.quantity, figure.unit) for figure in self.figures))
         noted = any(figure.note for figure in self.figures)
         headings = ["", *(f"{quantity} [{unit}]" for quantity, unit in columns), *(["note"] if noted else [])]
-        lines = [f"## {self.heading}\n", self.method + "\n"]
+        lines = [self.method + "\n"]
         if self.figures:
             lines += ["| " + " | ".join(headings) + " |", "|---|" + "---:|" * len(columns) + "---|" * noted]
         for case in cases:
@@ -121,10 +114,3 @@ class Section:
 def absent(case: str, quantity: str, unit: str, reason: object) -> Figure:
     """A figure without a measurement, with the reason in one line."""
     return Figure(case, quantity, None, unit, " ".join(str(reason).split()))
-
-
-def write_report(sections: Sequence[Section], machine: str, folder: OutputFolder, *, quick: bool) -> None:
-    """Write the report into a folder."""
-    introduction = INTRODUCTION.format(quick=" --quick" if quick else "")
-    text = "\n".join([introduction, f"{machine}\n", *(section.markdown() for section in sections)])
-    (folder / REPORT_NAME).write_text(text.rstrip() + "\n", encoding="utf-8")

@@ -32,18 +32,19 @@ class Bench:
         Raises:
             OSError: a read-only folder (checked before the work).
         """
-        from surgsim_apps.bench import measurement, report
+        from surgsim_apps.bench import measurement, page, report
 
         folder = report_folder(self.out, "benchmarks", quick=self.quick)
-        with output_folder(folder, [report.REPORT_NAME]) as files:
+        with output_folder(folder, [page.REPORT_NAME]) as files:
             before = report.load()
             sections: list[report.Section] = []
             for measure in measured_parts():
                 section = measure(measurement.QUICK if self.quick else measurement.FULL)
                 sections.append(section)
-                console.print(section.markdown(), highlight=False, soft_wrap=True, markup=False)
-            report.write_report(sections, report.describe(before), files, quick=self.quick)
-        path = folder / report.REPORT_NAME
+                text = f"## {section.heading}\n\n{section.markdown()}"
+                console.print(text, highlight=False, soft_wrap=True, markup=False)
+            page.write_page(sections, report.describe(before), files, quick=self.quick)
+        path = folder / page.REPORT_NAME
         console.print(f"written: {path}", highlight=False, soft_wrap=True)
         return 0
 

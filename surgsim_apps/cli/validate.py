@@ -27,7 +27,8 @@ class Validate:
             OSError: a read-only folder (checked before the work).
         """
         from surgsim_apps.validation import suite
-        from surgsim_apps.validation.report import REPORT_NAME, TABLE_NAME, print_report, write_report
+        from surgsim_apps.validation.page import REPORT_NAME
+        from surgsim_apps.validation.report import TABLE_NAME, print_report, write_report
 
         folder = report_folder(self.out, "validation", quick=self.quick)
         with output_folder(folder, [REPORT_NAME, TABLE_NAME]) as files:

@@ -113,10 +113,11 @@ SHORTFALLS = Path(__file__).with_name("known_shortfalls.toml")
 
 @dataclass(frozen=True)
 class Shortfall:
-    """Known shortfall: reason of a case that is not met, and the largest error for that reason."""
+    """Known shortfall: reason of a case that is not met, the largest error for that reason, and its cause."""
 
     reason: str
     error: float
+    cause: str
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def load_shortfalls() -> dict[str, Shortfall]:
     """Known shortfalls by the case's name."""
     table = tomllib.loads(SHORTFALLS.read_text(encoding="utf-8"))
     return {
-        case: Shortfall(entry["reason"], error)
+        case: Shortfall(entry["reason"], error, table["causes"][entry["cause"]])
         for entry in table["shortfall"]
         for case, error in entry["cases"].items()
     }

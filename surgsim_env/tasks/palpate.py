@@ -102,12 +102,14 @@ class PalpateTask(Task):
     `Box(-1, 1, (4,), float32)`
 
     ## Observation Space
-    `Box((11,), float32)`, all bounds finite. With `memory="summary"` seven numbers more, enough for a small network:
-    how much of the face was felt, and the ways to the stiffest place and to fresh sites. With `memory=True`
-    `Box((5057,), float32)`: what the sensor felt so far (`surgsim_env.palpation.touches`) on a map of n = 41 x 41
-    sites, 0.4 tip radii apart, over the middle of the palpable face (`surgsim_env.palpation.chart`), row by row, the
-    same size for every organ; farther apart where 16 tip radii do not span the face.
-    `env.unwrapped.observation_slices` has the entries of each channel by its name.
+    `Box((11,), float32)`, all bounds finite. `env.unwrapped.observation_slices` has the entries of each channel by its
+    name.
+
+    With `memory="summary"` seven numbers more, enough for a small network: how much of the face was felt, and the ways
+    to the stiffest place and to fresh sites. With `memory=True` `Box((5057,), float32)`: what the sensor felt so far
+    (`surgsim_env.palpation.touches`) on a map of n = 41 x 41 sites, 0.4 tip radii apart, over the middle of the
+    palpable face (`surgsim_env.palpation.chart`), row by row, the same size for every organ; farther apart where 16 tip
+    radii do not span the face.
 
     An instrument with taxels has three numbers more for each (`scenes/README.md`).
 

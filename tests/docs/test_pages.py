@@ -108,6 +108,16 @@ def test_tables_have_every_command_channel_and_reward(id):
     assert {name: float(weight) for name, weight in rows} == reward_weights(task)
 
 
+def test_channels_of_options_are_folded():
+    id = "SurgSim/Palpate-v0"
+    _, sections = docstring_sections(hook("generated_parts").environment_text(id))
+    shown, _, folded = sections["Observation Space"].partition("<details")
+    env = gym.make(id)
+    assert re.findall(r"^\| `(\w+)`", shown, flags=re.MULTILINE) == list(env.unwrapped.observation_slices)
+    assert "`felt_share`" in folded and 'memory="summary"' not in shown
+    env.close()
+
+
 def test_every_command_and_every_option_is_on_the_page():
     module = hook("generated_parts")
     text = module.command_list()

@@ -21,9 +21,8 @@ def test_validate(tmp_path, monkeypatch, capsys, spoilt, status):
     printed = capsys.readouterr().out
     assert "Table I" in printed and f"{int(spoilt)} not met" in printed
     report = (tmp_path / "validation.md").read_text(encoding="utf-8")
-    assert "| Table I | Sala 2011, Table I | +0.00565 % | 0.02 % | 5 met |" in report
-    assert ("| a wrong one | by hand | +100 % | 10 % | 1 not met |" in report) == spoilt
-    assert "    * bar in tension, cell 5.0 mm: +7.2 %, tolerance 7 %" in report
+    assert f"{13 + spoilt} comparisons" in report and f"{int(spoilt)} for an unknown" in report
+    assert "bar in tension, cell 5.0 mm: +7.2 %, tolerance 7 %" in report
     table = (tmp_path / "validation.csv").read_text(encoding="utf-8")
     assert '"Table I, h/a 0.40365, min cell","Sala 2011, Table I",-50.74 %,' in table
     assert ("a wrong one" in table) == spoilt

@@ -102,7 +102,7 @@ def write_leaderboard(folder: Path, path: Path) -> None:
     """Write the page of all results of a folder."""
     results = sorted(load_results(folder), key=_order)
     places = [best_raster_alone(list(rows)) for _, rows in groupby(results, key=lambda row: row.place)]
-    best = ["environment", "scene", "figure", "best method", "", "next", ""]
+    best = ["environment", "scene", "figure", "best method", "next"]
     lines = [_line(best), _line(["---"] * len(best)), *(_line(cells) for cells in map(_best, places) if cells)]
     parts = [HEADER, "\n".join(lines), "\n\n## All methods\n", *map(_folded, places), SUBMISSION, DEFINITIONS]
     with output_folder(path.parent) as files:
@@ -115,8 +115,8 @@ def _best(rows: Sequence[Result]) -> list[str]:
     if not honest:
         return []
     column = _columns(rows[0])[0]
-    cells = [cell for row in honest for cell in (_name(row), _cell(row.figures.get(column[1]), column, True))]
-    return [_environment(rows[0]), _title(rows[0]), column[0], *cells, *[""] * (4 - len(cells))]
+    cells = [f"{_name(row)}: {_cell(row.figures.get(column[1]), column, True)}" for row in honest]
+    return [_environment(rows[0]), _title(rows[0]), column[0], *cells, *[""] * (2 - len(cells))]
 
 
 def _environment(result: Result) -> str:

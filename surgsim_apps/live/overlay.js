@@ -45,6 +45,16 @@
     level = now;
   };
 
+  // In an upright window the panel begins folded: a press on its title, which is the server's label.
+  const fold = () => {
+    const title = [...document.querySelectorAll("div")].find((one) => !one.childElementCount && one.textContent === "surgsim");
+    if (!title) { setTimeout(fold, 200); return; }
+    const { x, y } = title.getBoundingClientRect(), where = { clientX: x, clientY: y, bubbles: true, isPrimary: true, pointerId: 1 };
+    for (const kind of ["pointerdown", "pointerup"]) title.dispatchEvent(new PointerEvent(kind, { ...where, button: 0 }));
+    title.click();
+  };
+  if (innerWidth < 640) addEventListener("load", fold);
+
   // viser sees a drag once the pointer has moved: a press that stays where it is becomes one by a step to and fro.
   const STEP = 6;
   addEventListener("pointerdown", (event) => {

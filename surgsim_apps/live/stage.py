@@ -42,7 +42,7 @@ FAT_COLOUR, FORCE_COLOUR, BRAND_COLOUR = (74, 46, 40), (255, 224, 102), (232, 89
 # its mesh.
 GROUND_GAP, CAVITY_REACH, CAVITY_RISE, RINGS, SPOKES = 0.002, 2.5, 1.0, 40, 96
 # Distance of the page's camera in distances of the overview camera, and its sideways shift in half picture heights.
-FARTHER, ASIDE = 1.5, 0.42
+FARTHER, FARTHER_UPRIGHT, ASIDE = 1.5, 2.3, 0.42
 # Ambient intensity in plain light.
 AMBIENT = 0.9
 # In the page's decimetres; HANDLE_SHARE limits the handle to a share of the organ.
@@ -70,11 +70,14 @@ STIFFNESS_MAP, NOTHING = "map", ""
 PAINT_ABOVE = 0.0004
 
 
-def page_camera(anatomy: Anatomy) -> Camera:
-    """The page's initial camera: as the overview, farther away, with the organ left of the panel."""
+def page_camera(anatomy: Anatomy, *, upright: bool = False) -> Camera:
+    """The page's initial camera: as the overview, farther away, with the organ left of the panel.
+
+    In an `upright` window, where the panel is folded, the organ is in the middle.
+    """
     near = scene_cameras(anatomy, aspect=1.2)["overview"]
-    distance = FARTHER * float(np.linalg.norm(near.position - near.target))
-    aside = ASIDE * distance * math.tan(math.radians(0.5 * near.fov)) * near.rotation[:, 0]
+    distance = (FARTHER_UPRIGHT if upright else FARTHER) * float(np.linalg.norm(near.position - near.target))
+    aside = (0.0 if upright else ASIDE) * distance * math.tan(math.radians(0.5 * near.fov)) * near.rotation[:, 0]
     target = near.target + aside
     return Camera.looking(target + distance * near.rotation[:, 2], target, near.up, near.fov)
 
@@ -93,6 +96,13 @@ class Surroundings:
         first = viser.initial_camera
         first.position, first.look_at, first.up = camera.position * SCALE, camera.target * SCALE, camera.up
         first.fov, first.near = math.radians(camera.fov), 0.05
+
+        @viser.on_client_connect
+        def _(client: Any) -> None:
+            if client.camera.aspect < 1.0:
+                upright = page_camera(anatomy, upright=True)
+                client.camera.position, client.camera.look_at = upright.position * SCALE, upright.target * SCALE
+
         viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
         viser.scene.world_axes.visible = False
         right, ahead = camera.rotation[:, 0], -camera.rotation[:, 2]

@@ -83,7 +83,7 @@ def picture(browser) -> np.ndarray:
 def seen_at(browser, page, place) -> tuple[float, float]:
     """Position on the page [pixels] of a scene's place [m]."""
     box = browser.run(f"(() => {{ const r = {CANVAS}; return [r.x, r.y, r.width, r.height]; }})()")
-    camera = page_camera(page.session.anatomy)
+    camera = page_camera(page.session.anatomy, upright=box[2] < box[3])
     at, _ = camera.project(np.array([place]), box[2], box[3])
     return box[0] + float(at[0, 0]), box[1] + float(at[0, 1])
 
@@ -178,6 +178,15 @@ def test_a_hidden_lesion_is_found_with_the_pointer_alone(served, chromium):
         assert f"{search.guess.points} points" in browser.text()
         browser.click_on("Find another")
         browser.wait_for("document.body.innerText.includes('0 presses')")
+
+
+def test_an_upright_window_begins_with_the_organ_in_the_middle(served, chromium):
+    with chromium.page(420, 800) as browser:
+        opened(browser, served)
+        # The panel is folded.
+        browser.wait_for("document.elementFromPoint(300, 700)?.tagName == 'CANVAS'")
+        with pressing(browser, served, middle_of(served.session.anatomy)):
+            browser.wait_until(lambda: shown_force(browser) > 0.05)
 
 
 def is_red(shot: np.ndarray) -> np.ndarray:

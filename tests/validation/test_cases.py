@@ -49,6 +49,15 @@ def test_the_page_is_of_the_table(tmp_path):
     assert (tmp_path / "validation.md").read_text(encoding="utf-8") == text
 
 
+def test_answers_of_other_pages_stand_there():
+    answers = re.sub(r"\\\n", "", page.ELSEWHERE).splitlines()
+    pages = [re.search(r"`docs/(\w+\.md)`", answer)[1] for answer in answers]
+    assert pages == ["reliability.md", "real_tissue.md"]
+    text = (DOCS / pages[1]).read_text(encoding="utf-8")
+    for figure in re.findall(r"\d[\d.]*", answers[1].partition("| presses")[2]):
+        assert f"{figure} %" in text
+
+
 def test_every_row_of_the_table_has_a_group():
     assert "Others" not in page.grouped(TABLE) and set(page.QUESTIONS) < set(page.grouped(TABLE))
 

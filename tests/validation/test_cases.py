@@ -54,7 +54,7 @@ def test_answers_of_other_pages_stand_there():
     pages = [re.search(r"`docs/(\w+\.md)`", answer)[1] for answer in answers]
     assert pages == ["reliability.md", "real_tissue.md"]
     text = (DOCS / pages[1]).read_text(encoding="utf-8")
-    for figure in re.findall(r"\d[\d.]*", answers[1].partition("| presses")[2]):
+    for figure in re.findall(r"(\d[\d.]*) (?:%|to)", answers[1].partition("| presses")[2]):
         assert f"{figure} %" in text
 
 

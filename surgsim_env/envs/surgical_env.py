@@ -1,9 +1,11 @@
 """The Gymnasium environment: it puts a simulation and a task together and computes no physics and no reward itself."""
 
+import inspect
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -16,6 +18,7 @@ from surgsim_env.coupling.lane_group import LaneGroup
 from surgsim_env.envs.saved_state import pack_state, restore_state, state_maker
 from surgsim_env.rendering.episode_view import RENDER_MODES, EpisodeView, Shown, Window
 from surgsim_env.rendering.looks import Look, LookRanges, draw_look, find_look_ranges, look_generator
+from surgsim_env.rendering.options import OPTION_NAMES, require_arguments
 from surgsim_env.scene.load import fill, require_known
 from surgsim_env.tasks.declaration import ControlStep, documentation
 from surgsim_env.tasks.runtime import make_runtime, setting_names
@@ -36,7 +39,7 @@ NOT_BEGUN = "no episode has begun, or its reset failed"
 OVER = "the episode is over"
 BROKEN_OFF = "an exception broke off the last step, so that its organ and its counts may not be of one moment"
 # Kinds of observation, and the size of an observed picture [pixels].
-OBSERVATION_MODES = ("state", "rgb", "rgb_force")
+OBSERVATION_MODES = ("state", "dict", "rgb", "rgb_force")
 PICTURE_SIZE = 84
 
 
@@ -48,8 +51,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     Args:
         scene: name or file of a scene; the task's default by default.
         instrument: name of an arm, or its TOML file; the task's default, else the scene's own, by default.
-        obs_mode: "state" observes the task's vector, "rgb" the endoscope's picture, uint8 of shape (84, 84, 3),
-            "rgb_force" a dictionary of the "picture" and, as "force", the channels that depend on force sensing.
+        obs_mode: "state" observes the task's vector, "dict" its channels by name, "rgb" the endoscope's picture, uint8
+            of shape (84, 84, 3), "rgb_force" a dictionary of the "picture" and, as "force", the channels that depend on
+            force sensing.
         observe_force: False observes all channels that depend on force sensing as 0.
         looks: "train" or "test" draws a look of all pictures for each episode (`take_looks`), None takes the scene's.
         measure_tissue: True measures the tissue's load in each step also where the scene has no limits of it.
@@ -85,6 +89,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     ) -> None:
         require_known("obs_mode", obs_mode, OBSERVATION_MODES)
         kind = self.task_class
+        require_arguments(settings, [*ARGUMENT_NAMES, *sorted(setting_names(kind)), *OPTION_NAMES])
         own = {name: settings.pop(name) for name in setting_names(kind) & set(settings)}
         simulation, self.runtime = make_runtime(kind, scene and str(scene), instrument and str(instrument), **own)
         self.runtime.measures_tissue |= measure_tissue
@@ -103,7 +108,9 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._eye: EpisodeView | None = None
         # Entries of the task's vector that are observed beside a picture; None: the picture alone.
         self._felt: list[int] | None = None
-        if obs_mode != "state":
+        # Entries of each channel that is observed by its name; None: one vector.
+        self._named: dict[str, slice] | None = None
+        if obs_mode.startswith("rgb"):
             sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE}
             sight |= {"show_force": False, "smooth_edges": False}
             self._eye = EpisodeView(self.simulation, "rgb_array", sight)
@@ -120,6 +127,12 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self.observation_space = gym.spaces.Dict({"picture": self.observation_space, "force": force})
         elif obs_mode == "state":
             self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        elif obs_mode == "dict":
+            self._named = {name: part for name, part in self.observation_slices.items() if part.start < part.stop}
+            boxes = {
+                name: gym.spaces.Box(low[part], high[part], dtype=np.float32) for name, part in self._named.items()
+            }
+            self.observation_space = gym.spaces.Dict(boxes)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.layout.action_size,), dtype=np.float32)
         self._observation = np.zeros(self._low.shape, dtype=np.float32)
         self._unobserved = [] if observe_force else self.layout.force_entries
@@ -391,7 +404,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
     def _observed(self) -> Observation:
         """The last observation, as obs_mode has it."""
         if self._eye is None:
-            return self._observed_numbers()
+            numbers = self._observed_numbers()
+            return numbers if self._named is None else {name: numbers[part] for name, part in self._named.items()}
         if self._picture is None:
             self._picture = self._eye.frame(self._shown())
         if self._felt is None:
@@ -449,3 +463,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},
         }
+
+
+# Without self and the settings of tasks and pictures.
+ARGUMENT_NAMES = [*inspect.signature(SurgicalEnv.__init__).parameters][1:-1]

@@ -1,5 +1,6 @@
 """Options of pictures."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -54,6 +55,9 @@ class RenderOptions:
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of pixels from 1 to {PIXELS_MOST}")
 
 
+OPTION_NAMES = [option.name for option in fields(RenderOptions)]
+
+
 def check_camera(camera: str) -> None:
     """Raise a ValueError with the known cameras if there is none of that name."""
     require_known("camera", camera, CAMERAS)
@@ -66,11 +70,13 @@ def render_options(arguments: dict[str, Any]) -> RenderOptions:
         UnknownArgumentError: an unknown argument (suggests the nearest).
         ValueError: a value that breaks its rule.
     """
-    known = [option.name for option in fields(RenderOptions)]
-    for name in arguments:
+    require_arguments(arguments, OPTION_NAMES)
+    return RenderOptions(**arguments)
+
+
+def require_arguments(given: Iterable[str], known: Sequence[str]) -> None:
+    """Raise an UnknownArgumentError with the known names and the nearest if one is not among them."""
+    for name in given:
         if name not in known:
             hint = nearest(name, known)
-            raise UnknownArgumentError(
-                f"unexpected keyword argument {name!r}; for pictures there are {', '.join(known)}{hint}"
-            )
-    return RenderOptions(**arguments)
+            raise UnknownArgumentError(f"unexpected keyword argument {name!r}; there are {', '.join(known)}{hint}")

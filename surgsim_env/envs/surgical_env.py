@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -129,7 +128,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         elif obs_mode == "dict":
             self._named = {name: part for name, part in self.observation_slices.items() if part.start < part.stop}
-            boxes = {
+            boxes: dict[str, gym.Space] = {
                 name: gym.spaces.Box(low[part], high[part], dtype=np.float32) for name, part in self._named.items()
             }
             self.observation_space = gym.spaces.Dict(boxes)

@@ -1,6 +1,6 @@
 """Options of pictures."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -74,7 +74,7 @@ def render_options(arguments: dict[str, Any]) -> RenderOptions:
     return RenderOptions(**arguments)
 
 
-def require_arguments(given: Iterable[str], known: Sequence[str]) -> None:
+def require_arguments(given: Iterable[str], known: list[str]) -> None:
     """Raise an UnknownArgumentError with the known names and the nearest if one is not among them."""
     for name in given:
         if name not in known:

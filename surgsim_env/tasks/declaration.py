@@ -315,8 +315,8 @@ middle of their bounds; with `scaled=False` SI units. Numbers and places of entr
 COMMON_ARGUMENTS = """* `scaled`: each value over its channel's scale, of order 1 (default); False: SI units.
 * `observe_force`: False observes all channels that depend on force sensing as 0.
 * `obs_mode`: "state" (default), "dict" for the channels by their names, "rgb" for the endoscope's picture,
-  `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL), or "rgb_force" for a dictionary of it ("picture") and of the channels
-  that depend on force sensing ("force").
+  `Box(0, 255, (84, 84, 3), uint8)` (needs OpenGL), or "rgb_force" for a dictionary of it ("picture") and of the
+  channels that depend on force sensing ("force").
 * `looks`: None (default), or "train" or "test" for pictures with a random look in each episode (docs/rendering.md).
 * `measure_tissue`: True measures the tissue's load in each step (`info`) also where the scene has no limits of it.
 * `control_step`: duration of a control step, a multiple of 1 ms [s]; 0.05 by default. With 0.25 an untrained network's

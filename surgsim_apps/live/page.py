@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import io
 import json
 import time
 from collections.abc import Callable
@@ -34,7 +35,9 @@ from surgsim_apps.live.stage import (
     OrganView,
     Surroundings,
     add_handle,
+    place,
 )
+from surgsim_env.rendering import scene_cameras
 
 # Between updates of the plots, and of the status text [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
@@ -165,7 +168,12 @@ class Page:
             "close_jaw": session.close_jaw,
             "hold_breath": session.hold_breath,
             "plain": self.show_plain,
+            "view": self._look_through,
+            "picture": _send_picture,
         }
+
+    def _look_through(self, client: Any, name: str) -> None:
+        place(client, scene_cameras(self.session.anatomy, aspect=client.camera.aspect)[name])
 
     def _choose_paint(self, kind: str) -> None:
         self._chosen_paint = kind
@@ -379,3 +387,12 @@ class Page:
         self._panel.show_phase(
             frame, recorded, jaw_closed=self.session.jaw_closed, breath_held=self.session.breath_held
         )
+
+
+def _send_picture(client: Any) -> None:
+    """Save a tab's view as a file of its browser."""
+    from PIL import Image
+
+    pixels, file = client.get_render(client.camera.image_height, client.camera.image_width), io.BytesIO()
+    Image.fromarray(pixels).save(file, "png")
+    client.send_file_download("surgsim.png", file.getvalue())

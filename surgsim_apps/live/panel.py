@@ -12,7 +12,7 @@ from surgsim_apps.haptics.pacing import Timeliness
 from surgsim_apps.live.exchange_records import Phase
 from surgsim_apps.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_apps.live.stage import CONTRASTS, LEVELS, NOTHING, STIFFNESS_MAP
-from surgsim_env.rendering import PAINTED_FIELDS, field_colours
+from surgsim_env.rendering import CAMERAS, PAINTED_FIELDS, field_colours
 from surgsim_env.scene import Scene
 
 # Time span of the plots [s], and their number of points.
@@ -74,7 +74,7 @@ class Panel:
             has_jaw: True if the first arm has a jaw.
             calls: callbacks by name: pause() and record(), which toggle;
                 reset(), show_lesions(on), paint(value of PAINTS), clear_map(), close_jaw(on), hold_breath(on),
-                plain(on).
+                plain(on), view(viser's client, name of a camera), picture(client).
         """
         self._gui, self._scene, self._calls = gui, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
@@ -99,6 +99,11 @@ class Panel:
             self._legend = gui.add_html(_legend_html(STIFFNESS_MAP, 0.0))
             self._clear = self._button("Clear", "clear the stiffness map", calls["clear_map"])
         self._plain = self._checkbox("Plain light", "plain", hint="faster without a graphics card")
+        with gui.add_folder("View", expand_by_default=False):
+            views = gui.add_button_group("Camera", CAMERAS)
+            views.on_click(lambda event: self._calls["view"](event.client, views.value))
+            picture = gui.add_button("Picture", hint="save it as a file", color=BUTTON_COLOUR)
+            picture.on_click(lambda event: self._calls["picture"](event.client))
         with gui.add_folder("Timing", expand_by_default=False):
             self._status = gui.add_html("")
         with gui.add_folder("How to steer", expand_by_default=False):

@@ -82,6 +82,13 @@ def page_camera(anatomy: Anatomy, *, upright: bool = False) -> Camera:
     return Camera.looking(target + distance * near.rotation[:, 2], target, near.up, near.fov)
 
 
+def place(client: Any, camera: Camera) -> None:
+    """Give the view of a tab to a camera."""
+    with client.atomic():
+        client.camera.position, client.camera.look_at = camera.position * SCALE, camera.target * SCALE
+        client.camera.up_direction, client.camera.fov = camera.up, math.radians(camera.fov)
+
+
 class Surroundings:
     """Camera, light and ground.
 
@@ -100,8 +107,7 @@ class Surroundings:
         @viser.on_client_connect
         def _(client: Any) -> None:
             if client.camera.aspect < 1.0:
-                upright = page_camera(anatomy, upright=True)
-                client.camera.position, client.camera.look_at = upright.position * SCALE, upright.target * SCALE
+                place(client, page_camera(anatomy, upright=True))
 
         viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
         viser.scene.world_axes.visible = False
@@ -264,7 +270,7 @@ class OrganView:
         """Show STIFFNESS_MAP, NOTHING or a field by its name, which `paint` or `paint_field` then colour."""
         self.paints, self._painted = kind, -1
         for paint in self._paint:
-            paint.cover(csr_array((0, 0)), np.zeros((0, 3)))
+            paint.cover(csr_array((0, 0)), np.zeros((0, 3), dtype=np.int32))
             paint.follow(np.zeros((0, 3)))
 
     def _cover(self, shares: FloatArray, faces: IntArray, mix: csr_array | None = None) -> None:

@@ -40,7 +40,7 @@ class Element:
     def set(self, value=True):
         self.value = value
         for call in self.calls:
-            call(None)
+            call(SimpleNamespace(client="tab"))
 
 
 class Gui:
@@ -55,6 +55,9 @@ class Gui:
 
     def add_button(self, label, **_):
         return self._add(label)
+
+    def add_button_group(self, label, options):
+        return self._add(label, options[0])
 
     def add_checkbox(self, label, initial_value, visible=True, **_):
         return self._add(label, initial_value, visible=visible)
@@ -83,7 +86,7 @@ class Gui:
 def made(scene, *, arm_count=1, has_jaw=False):
     """A panel, its gui, and the calls that were made."""
     gui, made_calls = Gui(), []
-    names = (*BUTTONS.values(), *SWITCHES.values(), "paint")
+    names = (*BUTTONS.values(), *SWITCHES.values(), "paint", "view", "picture")
     calls = {name: lambda *given, name=name: made_calls.append((name, *given)) for name in names}
     return Panel(gui, scene, arm_count, has_jaw, calls), gui, made_calls
 
@@ -129,6 +132,13 @@ def test_each_element_has_its_call():
     for label in (*BUTTONS, *SWITCHES):
         gui.elements[label].set(True)
     assert calls == [*((call,) for call in BUTTONS.values()), *((call, True) for call in SWITCHES.values())]
+
+
+def test_a_view_and_a_picture_are_of_the_tab_that_asks():
+    _, gui, calls = made(make_scene("phantom_small"))
+    gui.elements["Camera"].set("endoscope")
+    gui.elements["Picture"].set()
+    assert calls == [("view", "tab", "endoscope"), ("picture", "tab")]
 
 
 def test_the_paint_is_chosen_by_its_title_and_has_the_end_of_its_scale():

@@ -102,7 +102,7 @@ def write_leaderboard(folder: Path, path: Path) -> None:
     """Write the page of all results of a folder."""
     results = sorted(load_results(folder), key=_order)
     places = [best_raster_alone(list(rows)) for _, rows in groupby(results, key=lambda row: row.place)]
-    best = ["environment", "scene", "figure", "best method", "next"]
+    best = ["where", "best method", "next", "figure"]
     lines = [_line(best), _line(["---"] * len(best)), *(_line(cells) for cells in map(_best, places) if cells)]
     parts = [HEADER, "\n".join(lines), "\n\n## All methods\n", *map(_folded, places), SUBMISSION, DEFINITIONS]
     with output_folder(path.parent) as files:
@@ -116,11 +116,12 @@ def _best(rows: Sequence[Result]) -> list[str]:
         return []
     column = _columns(rows[0])[0]
     cells = [f"{_name(row)}: {_cell(row.figures.get(column[1]), column, True)}" for row in honest]
-    return [_environment(rows[0]), _title(rows[0]), column[0], *cells, *[""] * (2 - len(cells))]
+    return [_place(rows[0]), *cells, *[""] * (2 - len(cells)), column[0]]
 
 
-def _environment(result: Result) -> str:
-    return result.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+def _place(result: Result) -> str:
+    environment = result.env_id.removeprefix("SurgSim/").removesuffix("-v0")
+    return f"{environment} {'on ' * bool(result.scene)}{_title(result)}".strip()
 
 
 def _columns(result: Result) -> Sequence[Column]:
@@ -130,9 +131,8 @@ def _columns(result: Result) -> Sequence[Column]:
 def _folded(rows: list[Result]) -> str:
     """A table under its title, opened by a click."""
     first = rows[0]
-    title = f"{_environment(first)} {'on ' * bool(first.scene)}{_title(first).replace('`', '')}"
     text = (_presses if first.env_id == SITES else _steps)(rows)
-    return f"\n<details markdown><summary>{title}</summary>\n{text}\n</details>\n"
+    return f"\n<details markdown><summary>{_place(first).replace('`', '')}</summary>\n{text}\n</details>\n"
 
 
 def _is_block(result: Result) -> bool:

@@ -87,8 +87,8 @@ def test_the_leaderboard_has_the_least_area_first_and_the_best_raster_alone(tmp_
     result("gp_ucb", 8.0, env_kwargs={"scene": "liver_family", "split": "test"}).save(tmp_path)
     # Organs before blocks.
     rows = board(tmp_path)
-    (at,) = [index for index, row in enumerate(rows) if row[:2] == ["PalpateSites", "`phantom` (hard)"]]
-    assert [cell.partition(":")[0] for cell in rows[at][3:]] == ["gp_ucb", "sobol"]
+    (at,) = [index for index, row in enumerate(rows) if row[0] == "PalpateSites on `phantom` (hard)"]
+    assert [cell.partition(":")[0] for cell in rows[at][1:3]] == ["gp_ucb", "sobol"]
     organ, *block = [row[:3] for row in rows[at + 1 :] if row[0] not in ("method", "---")]
     assert organ == ["gp_ucb", "8.00 (4.00 to 16.00)", "8"]
     assert [row[0] for row in block] == ["gp_ucb", "sobol", "raster 3 x 3", "middle"]

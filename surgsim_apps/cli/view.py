@@ -9,7 +9,7 @@ from rich.console import Console
 
 from surgsim_apps.cli.values import AnyPath, MaybeNumber, MaybeScene, MaybeText, missing_packages
 from surgsim_apps.reports.output_folder import output_folder
-from surgsim_env.scene import make_scene, with_instrument, with_motion
+from surgsim_env.scene import Scene, make_scene, with_instrument, with_motion
 
 # The scene with ports for two arms, and its arms.
 BIMANUAL_SCENE, BIMANUAL_INSTRUMENT = "lobe", "psm_pair"
@@ -49,37 +49,45 @@ class View:
             import viser  # noqa: F401
         from surgsim_apps.live.live_organ import live_anatomy
         from surgsim_apps.live.organ_choice import lesion_kinds
-        from surgsim_apps.live.page import Page
+        from surgsim_apps.live.page import Page, Tabs
         from surgsim_apps.live.session import Session
 
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0.0):
             raise ValueError(f"--seconds is {self.seconds}; it must be finite and above 0")
         if not 0 <= self.port <= 65535:
             raise ValueError(f"--port is {self.port}; it must be from 0 (any free one) to 65535")
-        name, instrument = self.scene, self.instrument
-        if name is None:
-            name = BIMANUAL_SCENE if self.bimanual else "liver"
-        if instrument is None and self.bimanual:
-            instrument = BIMANUAL_INSTRUMENT
-        scene = with_motion(with_instrument(make_scene(name), instrument), self.motion)
+        name = str(self.scene or "") or (BIMANUAL_SCENE if self.bimanual else "liver")
+        instrument = self.instrument or (BIMANUAL_INSTRUMENT if self.bimanual else "")
+        opened = (name, instrument)
+        scene, tabs, end = self._load(*opened), None, math.inf
         # A folder that cannot be written is refused before a recording is lost.
         with output_folder(self.out):
             pass
-        session = Session(live_anatomy(scene, lesion_kinds(scene)[0], console))
-        page = None
         try:
-            session.wait()
-            page = Page(session, port=self.port, out=self.out)
-            console.print(f"open {page.server.address}", highlight=False, soft_wrap=True)
-            end = math.inf if self.seconds is None else time.monotonic() + self.seconds
-            try:
-                page.run(lambda: time.monotonic() >= end)
-            finally:
-                # At any end: Ctrl-C, or death of the physics.
-                if written := page.end_recording():
-                    console.print(written, highlight=False, soft_wrap=True)
+            while True:
+                session = Session(live_anatomy(scene, lesion_kinds(scene)[0], console))
+                try:
+                    session.wait()
+                    begins, tabs = tabs is None, tabs or Tabs(self.port)
+                    page = Page(session, tabs, self.out, opened, self._load)
+                    if begins:
+                        console.print(f"open {tabs.server.address}", highlight=False, soft_wrap=True)
+                        end = math.inf if self.seconds is None else time.monotonic() + self.seconds
+                    try:
+                        page.run(lambda end=end: time.monotonic() >= end)
+                    finally:
+                        # At any end: Ctrl-C, or death of the physics.
+                        if written := page.end_recording():
+                            console.print(written, highlight=False, soft_wrap=True)
+                    if page.wanted is None:
+                        return 0
+                    page.clear()
+                    opened, scene = page.wanted
+                finally:
+                    session.close()
         finally:
-            if page is not None:
-                page.server.stop()
-            session.close()
-        return 0
+            if tabs is not None:
+                tabs.server.stop()
+
+    def _load(self, scene: str, instrument: str) -> Scene:
+        return with_motion(with_instrument(make_scene(scene), instrument or None), self.motion)

@@ -22,7 +22,7 @@ from surgsim_apps.live.lesion_search import LesionSearch
 from surgsim_apps.live.messages import MARK, SEARCH, SOFTWARE, read_hand
 from surgsim_apps.live.organ_choice import HIDDEN, chosen_lesions, lesion_kinds
 from surgsim_apps.live.painted_tissue import PaintedTissue
-from surgsim_apps.live.panel import Panel, status_rows
+from surgsim_apps.live.panel import Opened, Panel, status_rows
 from surgsim_apps.live.recording import write_recording
 from surgsim_apps.live.session import Session
 from surgsim_apps.live.stage import (
@@ -35,9 +35,11 @@ from surgsim_apps.live.stage import (
     OrganView,
     Surroundings,
     add_handle,
+    page_camera,
     place,
 )
 from surgsim_env.rendering import scene_cameras
+from surgsim_env.scene import Scene, make_scene, with_instrument
 
 # Between updates of the plots, and of the status text [s].
 PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
@@ -50,19 +52,32 @@ DEEPER = 1.6
 STEERING = "Press and hold on the organ, drag to slide, shift to press deeper. Drag beside it to turn the view."
 
 
-class HandSockets:
-    """Sockets of `hand.js`, one per tab.
+class Tabs:
+    """The browser's side: a guarded server, and a socket of `hand.js` for each tab. Pages follow one another on it.
 
     Fields:
+        server: for pages
         software: True once a tab without a graphics card was opened
     """
 
-    def __init__(self, session: Session, calls: dict[bytes, Callable[[], None]]) -> None:
-        """Push a session's hands; `calls` are made at their packets."""
-        self._session, self._calls = session, calls
+    def __init__(self, port: int) -> None:
+        """Serve an empty page.
+
+        Raises:
+            LiveError: see `GuardedServer`.
+        """
+        self._page: Page | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._connections: set[ServerConnection] = set()
         self.software = False
+        self.server = GuardedServer(port, self.serve)
+        self.server.viser.on_client_connect(lambda client: self._page and self._page.place(client))
+
+    def show(self, page: "Page") -> None:
+        """Let the tabs steer and show a page."""
+        self._page = page
+        for client in self.server.viser.get_clients().values():
+            page.place(client)
 
     async def serve(self, connection: ServerConnection) -> None:
         """Serve one tab until it is closed."""
@@ -74,10 +89,8 @@ class HandSockets:
                     message = await connection.recv(decode=False)
                     if message == SOFTWARE:
                         self.software = True
-                    elif message in self._calls:
-                        self._calls[message]()
-                    else:
-                        self._session.push(read_hand(message))
+                    elif self._page is not None:
+                        self._page.hear(message)
         finally:
             self._connections.discard(connection)
 
@@ -92,26 +105,36 @@ class Page:
 
     Fields:
         session, server: the physics' side and the browsers' side
+        wanted: scene chosen in the panel, with its names; None for none
         felt: stiffness map of this organ from the touches so far
         search: for a hidden lesion
         pictures: number of pictures sent
     """
 
-    def __init__(self, session: Session, *, port: int, out: Path) -> None:
+    def __init__(
+        self,
+        session: Session,
+        tabs: Tabs,
+        out: Path,
+        opened: Opened = ("", ""),
+        load: Callable[[str, str], Scene] = lambda scene, instrument: with_instrument(
+            make_scene(scene), instrument or None
+        ),
+    ) -> None:
         """Serve.
 
         Args:
             session: a running one.
-            port: see `GuardedServer`.
+            tabs: the browsers' side, empty.
             out: folder for recordings.
-
-        Raises:
-            LiveError: see `GuardedServer`.
+            opened: scene and instrument of the session, as the panel's menu names them.
+            load: makes a scene of two names of the menu, or raises a ValueError.
         """
-        self.session, self._out = session, out
+        self.session, self._tabs, self._out = session, tabs, out
+        self.server = tabs.server
+        self.wanted: tuple[Opened, Scene] | None = None
+        self._opened, self._load = opened, load
         self.search = LesionSearch(session.anatomy)
-        self._tabs = HandSockets(session, {SEARCH: self._begin_search, MARK: self._mark})
-        self.server = GuardedServer(port, self._tabs.serve)
         self.felt = FeltMap(session.anatomy)
         self._tissue, self._chosen_paint = PaintedTissue(session), STIFFNESS_MAP
         self._painter = ThreadPoolExecutor(1, "surgsim paint")
@@ -140,7 +163,30 @@ class Page:
                 session.arm_count,
                 session.instrument.jaw is not None,
                 self._calls(),
+                opened,
             )
+        tabs.show(self)
+
+    def place(self, client: Any) -> None:
+        """Give a tab's view to the page's camera."""
+        place(client, page_camera(self.session.anatomy, upright=client.camera.aspect < 1.0))
+
+    def hear(self, message: bytes) -> None:
+        """Take a packet of a tab's scripts."""
+        if message == SEARCH:
+            self._begin_search()
+        elif message == MARK:
+            self._mark()
+        else:
+            self.session.push(read_hand(message))
+
+    def clear(self) -> None:
+        """Leave the tabs empty, for another page."""
+        self._painter.shutdown()
+        self._tabs.send(self._overlay(self.session.frame()) | {"text": "loading ...", "button": ""})
+        with self.server.viser.atomic():
+            self.server.viser.scene.reset()
+            self.server.viser.gui.reset()
 
     def _add_instrument(self) -> None:
         """The instrument, a handle at each hand, an arrow of force at each tip."""
@@ -170,7 +216,16 @@ class Page:
             "plain": self.show_plain,
             "view": self._look_through,
             "picture": _send_picture,
+            "open": self._open,
         }
+
+    def _open(self, scene: str, instrument: str) -> None:
+        if (scene, instrument) == self._opened:
+            return
+        try:
+            self.wanted = (scene, instrument), self._load(scene, instrument)
+        except ValueError as error:
+            self._message = str(error)
 
     def _look_through(self, client: Any, name: str) -> None:
         place(client, scene_cameras(self.session.anatomy, aspect=client.camera.aspect)[name])
@@ -193,7 +248,7 @@ class Page:
         due = time.monotonic()
         self._before, self._pictures_before = self.session.timing(), 0
         plot_due = status_due = due
-        while not until():
+        while not until() and self.wanted is None:
             self.session.require_alive()
             now = time.monotonic()
             frame = self.session.frame()

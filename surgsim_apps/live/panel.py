@@ -13,7 +13,7 @@ from surgsim_apps.live.exchange_records import Phase
 from surgsim_apps.live.organ_choice import HIDDEN, SHOWN, OrganChoice, lesion_kinds
 from surgsim_apps.live.stage import CONTRASTS, LEVELS, NOTHING, STIFFNESS_MAP
 from surgsim_env.rendering import CAMERAS, PAINTED_FIELDS, field_colours
-from surgsim_env.scene import Scene
+from surgsim_env.scene import Scene, list_arms, list_scenes
 
 # Time span of the plots [s], and their number of points.
 PLOTTED, PLOT_POINTS = 10.0, 250
@@ -29,6 +29,9 @@ PAINTS = {
     "stiffness map": STIFFNESS_MAP,
     **{field.title: name for name, field in PAINTED_FIELDS.items()},
 }
+# Names of a scene and an instrument; "" for the scene's own instrument, which the menu calls OWN_INSTRUMENT.
+Opened = tuple[str, str]
+OWN_INSTRUMENT = "the scene's own"
 BUTTON_COLOUR = (52, 84, 96)
 ARM_COLOURS = ("#e8590c", "#1971c2")
 TITLES = {
@@ -64,6 +67,7 @@ class Panel:
         arm_count: int,
         has_jaw: bool,
         calls: dict[str, Callable[..., None]],
+        opened: Opened = ("", ""),
     ) -> None:
         """Build it.
 
@@ -74,13 +78,22 @@ class Panel:
             has_jaw: True if the first arm has a jaw.
             calls: callbacks by name: pause() and record(), which toggle;
                 reset(), show_lesions(on), paint(value of PAINTS), clear_map(), close_jaw(on), hold_breath(on),
-                plain(on), view(viser's client, name of a camera), picture(client).
+                plain(on), view(viser's client, name of a camera), picture(client), open(scene, instrument).
+            opened: scene and instrument that the menu shows; a file's path or a name.
         """
         self._gui, self._scene, self._calls = gui, scene, calls
         self.choice = OrganChoice(lesions=lesion_kinds(scene)[0])
         self._changed: float | None = None
         self._headline = gui.add_html(_status_html("starting", []))
         self._add_buttons()
+        with gui.add_folder("Scene", expand_by_default=False):
+            scenes = dict.fromkeys((opened[0] or scene.name, *list_scenes()))
+            arms = dict.fromkeys((opened[1] or OWN_INSTRUMENT, OWN_INSTRUMENT, *list_arms()))
+            self._scenes, self._arms = (
+                gui.add_dropdown(*menu) for menu in (("Organ", tuple(scenes)), ("Instrument", tuple(arms)))
+            )
+            for menu in (self._scenes, self._arms):
+                menu.on_update(lambda _: self._open())
         self._jaw = self._checkbox("Close the jaw", "close_jaw", visible=has_jaw)
         hint = "the present breath ends, and no other begins; the heart goes on"
         self._breath = self._checkbox("Hold the breath", "hold_breath", visible=scene.has_breath, hint=hint)
@@ -209,6 +222,10 @@ class Panel:
         for control in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
             control.on_update(lambda _: self._choose())
         self._show_lesions = self._checkbox("Show lesions", "show_lesions")
+
+    def _open(self) -> None:
+        instrument = self._arms.value
+        self._calls["open"](self._scenes.value, "" if instrument == OWN_INSTRUMENT else instrument)
 
     def _choose(self, **changes: Any) -> None:
         scene = self._scene

@@ -103,12 +103,6 @@ class Surroundings:
         first = viser.initial_camera
         first.position, first.look_at, first.up = camera.position * SCALE, camera.target * SCALE, camera.up
         first.fov, first.near = math.radians(camera.fov), 0.05
-
-        @viser.on_client_connect
-        def _(client: Any) -> None:
-            if client.camera.aspect < 1.0:
-                place(client, page_camera(anatomy, upright=True))
-
         viser.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False, brand_color=BRAND_COLOUR)
         viser.scene.world_axes.visible = False
         right, ahead = camera.rotation[:, 0], -camera.rotation[:, 2]

@@ -24,6 +24,7 @@ from surgsim_env.scene.levels import LESION_GAP, LEVELS, REFERENCE_TIP
 from surgsim_env.scene.load import (
     agents_folder,
     fill,
+    list_arms,
     list_materials,
     list_scenes,
     load_scene,
@@ -118,6 +119,7 @@ __all__ = [
     "fill",
     "hertz_force",
     "hidden_share",
+    "list_arms",
     "list_materials",
     "list_motions",
     "list_scenes",

@@ -10,7 +10,7 @@ from websockets.asyncio.client import connect
 from surgsim_apps.haptics.pacing import PaceSettings
 from surgsim_apps.live.live_organ import live_organ
 from surgsim_apps.live.organ_choice import OrganChoice, lesion_kinds
-from surgsim_apps.live.page import Page
+from surgsim_apps.live.page import Page, Tabs
 from surgsim_apps.live.session import Session
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.load import make_scene
@@ -45,7 +45,7 @@ class Served:
         self.hand_clock = Clock()
         self.session = Session(on_a_fast_machine(make_scene("phantom_small")), pace=PACE, clock=self.hand_clock)
         self.session.wait()
-        self.page = Page(self.session, port=0, out=out)
+        self.page = Page(self.session, Tabs(0), out)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.page.run, args=(self._stop.is_set,))
         self._thread.start()
@@ -65,7 +65,11 @@ class Served:
         return float(np.linalg.norm(self.session.frame()["force"][0]))
 
     def hand_socket(self):
-        origin, _, token = self.address.rpartition("/")
+        return self.hand_socket_of(self.address)
+
+    @staticmethod
+    def hand_socket_of(server_address: str):
+        origin, _, token = server_address.rpartition("/")
         address = f"{origin.replace('http', 'ws')}/{token}/hand"
         return connect(address, origin=origin, open_timeout=SECONDS, ping_interval=None)
 

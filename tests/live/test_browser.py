@@ -14,7 +14,7 @@ from PIL import Image
 from surgsim_apps.haptics.pacing import PaceSettings
 from surgsim_apps.live.exchange_records import Pause, Phase, Reset
 from surgsim_apps.live.messages import HandMotion
-from surgsim_apps.live.page import Page
+from surgsim_apps.live.page import Page, Tabs
 from surgsim_apps.live.session import HAND_SPEED, Session
 from surgsim_apps.live.stage import page_camera
 from surgsim_env.scene.load import make_scene, with_instrument
@@ -34,7 +34,7 @@ def serving(scene: Scene, folder: Path, clock: Callable[[], float] = time.monoto
     thread = None
     try:
         session.wait()
-        page = Page(session, port=0, out=folder / "out")
+        page = Page(session, Tabs(0), folder / "out")
         thread = threading.Thread(target=page.run, args=(stop.is_set,))
         thread.start()
         yield page

@@ -10,7 +10,7 @@ import pytest
 
 from surgsim_apps.live.exchange_records import LiveError
 from surgsim_apps.live.organ_choice import HIDDEN, OrganChoice
-from surgsim_apps.live.page import Page
+from surgsim_apps.live.page import Page, Tabs
 from surgsim_apps.live.session import Session
 from surgsim_env.scene.load import make_scene
 from tests.live.served import PACE, on_a_fast_machine, wait_until
@@ -58,7 +58,7 @@ def test_a_physics_that_dies_is_said(tmp_path):
     page = None
     try:
         session.wait()
-        page = Page(session, port=0, out=tmp_path)
+        page = Page(session, Tabs(0), tmp_path)
         session._process.kill()
         with pytest.raises(LiveError, match="physics' process died"):
             page.run(lambda: False)

@@ -65,8 +65,8 @@ class Gui:
     def add_slider(self, label, initial_value, **_):
         return self._add(label, initial_value)
 
-    def add_dropdown(self, label, options, initial_value):
-        return self._add(label, initial_value, options=options)
+    def add_dropdown(self, label, options, initial_value=None):
+        return self._add(label, initial_value or options[0], options=options)
 
     def add_uplot(self, data, series, scales, **_):
         plot = Element(data=data, series=series, scales=scales)
@@ -86,7 +86,7 @@ class Gui:
 def made(scene, *, arm_count=1, has_jaw=False):
     """A panel, its gui, and the calls that were made."""
     gui, made_calls = Gui(), []
-    names = (*BUTTONS.values(), *SWITCHES.values(), "paint", "view", "picture")
+    names = (*BUTTONS.values(), *SWITCHES.values(), "paint", "view", "picture", "open")
     calls = {name: lambda *given, name=name: made_calls.append((name, *given)) for name in names}
     return Panel(gui, scene, arm_count, has_jaw, calls), gui, made_calls
 
@@ -132,6 +132,14 @@ def test_each_element_has_its_call():
     for label in (*BUTTONS, *SWITCHES):
         gui.elements[label].set(True)
     assert calls == [*((call,) for call in BUTTONS.values()), *((call, True) for call in SWITCHES.values())]
+
+
+def test_the_menu_opens_a_scene_with_an_instrument():
+    _, gui, calls = made(make_scene("phantom_small"))
+    assert gui.elements["Organ"].value == "phantom_small" and "liver" in gui.elements["Organ"].options
+    gui.elements["Organ"].set("liver")
+    gui.elements["Instrument"].set("psm_palpator")
+    assert calls == [("open", "liver", ""), ("open", "liver", "psm_palpator")]
 
 
 def test_a_view_and_a_picture_are_of_the_tab_that_asks():

@@ -25,7 +25,7 @@ NAMES = sorted(path.stem for path in TUTORIALS.glob("*.md") if path.stem != "ind
 QUICK = {
     "own_organ": [("--out runs/kidney", "--out runs/kidney --around 0.02,0.01,0.021,0.012")],
     "train_an_agent": [
-        ("model.learn(100_000)", "model.learn(1_024)"),
+        ("model.learn(50_000)", "model.learn(1_024)"),
         ("make_envs(16, shaping", "make_envs(8, shaping"),
         ("scored = make_envs(16)", "scored = make_envs(8)"),
         ("n_eval_episodes=96", "n_eval_episodes=8"),

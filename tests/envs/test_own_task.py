@@ -87,26 +87,26 @@ def test_one_more_channel_and_reward_in_a_shipped_task_are_one_place(registered)
     env, plain = (gym.make(env_id, scene="phantom_small") for env_id in (id, "SurgSim/Palpate-v0"))
     inner = env.unwrapped
     slices = inner.observation_slices
-    assert slices == {**plain.unwrapped.observation_slices, "height": slice(10, 12)}
+    assert slices == {**plain.unwrapped.observation_slices, "height": slice(11, 13)}
     space = env.observation_space
-    assert space.shape == (12,) and (space.high[10:] == np.float32(10.0)).all() and (space.low[10:] < 0.0).all()
+    assert space.shape == (13,) and (space.high[11:] == np.float32(10.0)).all() and (space.low[11:] < 0.0).all()
     assert "| `height` | 2 | height of the tip, and a hundredth [m] | +-0.1 | 0.01 m |" in inner.__doc__
     assert "| `slow` | -0.5 | control step | speed of the tip |" in inner.__doc__
     assert "## Starting State" in inner.__doc__ or inner.__doc__.startswith("Palpate slowly.")
     observation, info = env.reset(seed=3)
-    np.testing.assert_array_equal(observation[:10], plain.reset(seed=3)[0])
+    np.testing.assert_array_equal(observation[:11], plain.reset(seed=3)[0])
     assert info["reward_slow"] == 0.0
     down = np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32)
     for _ in range(3):
         (observation, reward, *_, info), (expected, paid, *_) = env.step(down), plain.step(down)
-    np.testing.assert_array_equal(observation[:10], expected)
+    np.testing.assert_array_equal(observation[:11], expected)
     seen = inner.si_values(observation)
     np.testing.assert_allclose(seen[slices["height"]], [seen[2], 0.01], atol=1e-7)
     np.testing.assert_allclose(observation[slices["height"]], [100.0 * seen[2], 1.0], rtol=1e-5)
     assert info["reward_slow"] == pytest.approx(-0.5 * 0.01, rel=0.1)
     assert reward == pytest.approx(paid + info["reward_slow"])
     envs = gym.make_vec(id, num_envs=2, vectorization_mode="vector_entry_point", scene="phantom_small")
-    assert envs.reset(seed=[3, 4])[0].shape == (2, 12) and envs.unwrapped.observation_slices == slices
+    assert envs.reset(seed=[3, 4])[0].shape == (2, 13) and envs.unwrapped.observation_slices == slices
     envs.close()
 
 

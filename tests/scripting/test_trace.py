@@ -95,7 +95,7 @@ def test_tables_read_back_to_the_bit_and_repeat_to_the_byte(tmp_path):
     table = read(control)
     assert column(table, "time_s").tobytes() == trace.control_time.tobytes()
     assert column(table, "reward").tobytes() == trace.reward.tobytes()
-    seen = np.stack([column(table, f"observation_{index}") for index in range(58)], axis=1).astype(np.float32)
+    seen = np.stack([column(table, f"observation_{index}") for index in range(11 + 48)], axis=1).astype(np.float32)
     assert seen.tobytes() == trace.observation.tobytes()
     assert column(table, "force_peak").max() == max(info["force_peak"] for info in trace.infos)
     again = trace.to_csv(tmp_path / "again.csv")

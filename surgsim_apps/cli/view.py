@@ -56,16 +56,20 @@ class View:
             raise ValueError(f"--seconds is {self.seconds}; it must be finite and above 0")
         if not 0 <= self.port <= 65535:
             raise ValueError(f"--port is {self.port}; it must be from 0 (any free one) to 65535")
-        name = str(self.scene or "") or (BIMANUAL_SCENE if self.bimanual else "liver")
-        instrument = self.instrument or (BIMANUAL_INSTRUMENT if self.bimanual else "")
-        opened = (name, instrument)
-        scene, tabs, end = self._load(*opened), None, math.inf
+        scene, instrument = self.scene, self.instrument
+        # An empty text is no default: it is refused as a name.
+        if scene is None:
+            scene = BIMANUAL_SCENE if self.bimanual else "liver"
+        if instrument is None and self.bimanual:
+            instrument = BIMANUAL_INSTRUMENT
+        opened = (str(scene), instrument)
+        chosen, tabs, end = self._load(*opened), None, math.inf
         # A folder that cannot be written is refused before a recording is lost.
         with output_folder(self.out):
             pass
         try:
             while True:
-                session = Session(live_anatomy(scene, lesion_kinds(scene)[0], console))
+                session = Session(live_anatomy(chosen, lesion_kinds(chosen)[0], console))
                 try:
                     session.wait()
                     begins, tabs = tabs is None, tabs or Tabs(self.port)
@@ -82,12 +86,12 @@ class View:
                     if page.wanted is None:
                         return 0
                     page.clear()
-                    opened, scene = page.wanted
+                    opened, chosen = page.wanted
                 finally:
                     session.close()
         finally:
             if tabs is not None:
                 tabs.server.stop()
 
-    def _load(self, scene: str, instrument: str) -> Scene:
-        return with_motion(with_instrument(make_scene(scene), instrument or None), self.motion)
+    def _load(self, scene: str, instrument: str | None) -> Scene:
+        return with_motion(with_instrument(make_scene(scene), instrument), self.motion)

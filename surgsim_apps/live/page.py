@@ -116,9 +116,9 @@ class Page:
         session: Session,
         tabs: Tabs,
         out: Path,
-        opened: Opened = ("", ""),
-        load: Callable[[str, str], Scene] = lambda scene, instrument: with_instrument(
-            make_scene(scene), instrument or None
+        opened: Opened = ("", None),
+        load: Callable[[str, str | None], Scene] = lambda scene, instrument: with_instrument(
+            make_scene(scene), instrument
         ),
     ) -> None:
         """Serve.
@@ -219,7 +219,7 @@ class Page:
             "open": self._open,
         }
 
-    def _open(self, scene: str, instrument: str) -> None:
+    def _open(self, scene: str, instrument: str | None) -> None:
         if (scene, instrument) == self._opened:
             return
         try:

@@ -29,8 +29,8 @@ PAINTS = {
     "stiffness map": STIFFNESS_MAP,
     **{field.title: name for name, field in PAINTED_FIELDS.items()},
 }
-# Names of a scene and an instrument; "" for the scene's own instrument, which the menu calls OWN_INSTRUMENT.
-Opened = tuple[str, str]
+# Names of a scene and an instrument; None for the scene's own instrument, which the menu calls OWN_INSTRUMENT.
+Opened = tuple[str, str | None]
 OWN_INSTRUMENT = "the scene's own"
 BUTTON_COLOUR = (52, 84, 96)
 ARM_COLOURS = ("#e8590c", "#1971c2")
@@ -67,7 +67,7 @@ class Panel:
         arm_count: int,
         has_jaw: bool,
         calls: dict[str, Callable[..., None]],
-        opened: Opened = ("", ""),
+        opened: Opened = ("", None),
     ) -> None:
         """Build it.
 
@@ -225,7 +225,7 @@ class Panel:
 
     def _open(self) -> None:
         instrument = self._arms.value
-        self._calls["open"](self._scenes.value, "" if instrument == OWN_INSTRUMENT else instrument)
+        self._calls["open"](self._scenes.value, None if instrument == OWN_INSTRUMENT else instrument)
 
     def _choose(self, **changes: Any) -> None:
         scene = self._scene

@@ -22,7 +22,7 @@ def test_another_scene_is_shown_in_the_same_tabs(tmp_path):
             session = Session(on_a_fast_machine(make_scene(scene)), pace=PACE)
             try:
                 session.wait()
-                page = Page(session, tabs, tmp_path, (scene, ""))
+                page = Page(session, tabs, tmp_path, (scene, None))
                 pages.append(page)
                 updates = client.updates
                 page.run(lambda updates=updates: client.updates > updates + 10)
@@ -53,5 +53,5 @@ async def _send(tabs: Tabs, packet: bytes) -> None:
 @pytest.mark.usefixtures("fresh")
 def test_a_scene_that_cannot_be_opened_is_refused_in_words(served):
     page = served.page
-    page._open("phantom_smal", "")
+    page._open("phantom_smal", None)
     assert page.wanted is None and "phantom_small" in page._message

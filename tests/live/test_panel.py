@@ -139,7 +139,7 @@ def test_the_menu_opens_a_scene_with_an_instrument():
     assert gui.elements["Organ"].value == "phantom_small" and "liver" in gui.elements["Organ"].options
     gui.elements["Organ"].set("liver")
     gui.elements["Instrument"].set("psm_palpator")
-    assert calls == [("open", "liver", ""), ("open", "liver", "psm_palpator")]
+    assert calls == [("open", "liver", None), ("open", "liver", "psm_palpator")]
 
 
 def test_a_view_and_a_picture_are_of_the_tab_that_asks():

@@ -59,7 +59,7 @@ def test_torchrl_makes_one_environment_by_its_id() -> None:
     envs = pytest.importorskip("torchrl.envs", reason="needs torchrl (`make test-agents`)")
     env = envs.GymEnv("surgsim_env:SurgSim/Palpate-v0", scene="phantom_small")
     envs.check_env_specs(env)
-    assert env.rollout(3)["next", "observation"].shape == (3, 10)
+    assert env.rollout(3)["next", "observation"].shape == (3, 11)
 
 
 def test_supersuit_pads_the_arms_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,6 +25,12 @@ class Guess:
     force_peak: float
     points: int
 
+    @property
+    def text(self) -> str:
+        """Error, effort and points in a line."""
+        effort = f"{self.presses} presses, at most {self.force_peak:.2f} N"
+        return f"{1e3 * self.error:.1f} mm from the lesion, {effort}: {self.points} points of 100"
+
 
 class LesionSearch:
     """Searches in turn on one organ; the first has the lesion of the day, the same for everybody.
@@ -62,11 +68,15 @@ class LesionSearch:
         """End the search; the place of the last press is the guess. Without a press it goes on."""
         if self._tip is None:
             return
+        place, _ = self._anatomy.face.project(self._tip)
+        self.guess = self.rated(place, self.presses, self._peak, lesions)
+        self.open = False
+
+    def rated(self, place: FloatArray, presses: int, force_peak: float, lesions: list[Lesion]) -> Guess:
+        """The guess of a place on the surface [m], (3,), after presses with a peak force [N]."""
         anatomy, limits = self._anatomy, self._anatomy.scene.limits
-        place, _ = anatomy.face.project(self._tip)
         truths = [anatomy.face.project(lesion.centre)[0] for lesion in lesions if lesion.centre is not None]
         error = min(float(anatomy.along_surface(truth, place[None])[0]) for truth in truths)
-        excess = (self._peak - limits.soft_force) / (limits.hard_force - limits.soft_force)
-        cost = MM_COST * 1e3 * error + PRESS_COST * self.presses + FORCE_COST * max(0.0, excess)
-        self.guess = Guess(error, self.presses, self._peak, max(0, round(100.0 - cost)))
-        self.open = False
+        excess = (force_peak - limits.soft_force) / (limits.hard_force - limits.soft_force)
+        cost = MM_COST * 1e3 * error + PRESS_COST * presses + FORCE_COST * max(0.0, excess)
+        return Guess(error, presses, force_peak, max(0, round(100.0 - cost)))

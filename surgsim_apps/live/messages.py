@@ -1,4 +1,4 @@
-"""Packets of the page's scripts: keys or a gamepad, the button over the picture, a browser's drawing in software."""
+"""Packets of the page's scripts: keys or a gamepad, the buttons over the picture, a browser's drawing in software."""
 
 import struct
 from dataclasses import dataclass
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 # Little-endian: along the view's right, away from the viewer, out of the organ, each -1 to 1; the arm, 0 or 1; 1 to
 # toggle its jaw, else 0.
 _HAND = struct.Struct("<3fHH")
-# The packet of a browser without a graphics card, and of the button of `overlay.js`.
-SOFTWARE, SEARCH, MARK = b"software", b"search", b"mark"
+# The packets of a browser without a graphics card, and of the buttons of `overlay.js`.
+SOFTWARE, SEARCH, MARK, WATCH = b"software", b"search", b"mark", b"watch"
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,13 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.haptics.pacing import timeliness
 from surgsim_apps.live.exchange_records import Change, LiveError, Pause, Phase, Record, Reset
 from surgsim_apps.live.guarded_server import GuardedServer
-from surgsim_apps.live.lesion_search import LesionSearch
-from surgsim_apps.live.messages import MARK, SEARCH, SOFTWARE, read_hand
+from surgsim_apps.live.lesion_search import Guess, LesionSearch
+from surgsim_apps.live.messages import MARK, SEARCH, SOFTWARE, WATCH, read_hand
 from surgsim_apps.live.organ_choice import HIDDEN, chosen_lesions, lesion_kinds
 from surgsim_apps.live.painted_tissue import PaintedTissue
 from surgsim_apps.live.panel import Opened, Panel, status_rows
 from surgsim_apps.live.recording import write_recording
+from surgsim_apps.live.robot_search import PRESSES, RobotSearch
 from surgsim_apps.live.session import Session
 from surgsim_apps.live.stage import (
     SCALE,
@@ -41,8 +42,8 @@ from surgsim_apps.live.stage import (
 from surgsim_env.rendering import scene_cameras
 from surgsim_env.scene import Scene, make_scene, with_instrument
 
-# Between updates of the plots, and of the status text [s].
-PLOT_PERIOD, STATUS_PERIOD = 0.1, 0.5
+# Between updates of the plots, of the stiffness map and of the status text [s].
+PLOT_PERIOD, MAP_PERIOD, STATUS_PERIOD = 0.1, 0.3, 0.5
 # Longest wait for the physics to end a recording [s].
 END_TIMEOUT = 2.0
 # Time between pictures [s].
@@ -108,6 +109,7 @@ class Page:
         wanted: scene chosen in the panel, with its names; None for none
         felt: stiffness map of this organ from the touches so far
         search: for a hidden lesion
+        robot, robot_guess: a search for it by the machine, and its result; None for none
         pictures: number of pictures sent
     """
 
@@ -135,11 +137,13 @@ class Page:
         self.wanted: tuple[Opened, Scene] | None = None
         self._opened, self._load = opened, load
         self.search = LesionSearch(session.anatomy)
+        self.robot: RobotSearch | None = None
+        self.robot_guess: Guess | None = None
         self.felt = FeltMap(session.anatomy)
         self._tissue, self._chosen_paint = PaintedTissue(session), STIFFNESS_MAP
         self._painter = ThreadPoolExecutor(1, "surgsim paint")
         self._shares = self._painter.submit(self._tissue.shares)
-        self.pictures = 0
+        self.pictures, self._map_due = 0, 0.0
         self._organ_number, self._traced = 1, 0
         self._dragged_arm = 0
         self._held: set[int] = set()
@@ -177,13 +181,15 @@ class Page:
             self._begin_search()
         elif message == MARK:
             self._mark()
+        elif message == WATCH:
+            self._watch()
         else:
             self.session.push(read_hand(message))
 
     def clear(self) -> None:
         """Leave the tabs empty, for another page."""
         self._painter.shutdown()
-        self._tabs.send(self._overlay(self.session.frame()) | {"text": "loading ...", "button": ""})
+        self._tabs.send(self._overlay(self.session.frame()) | {"text": "loading ...", "buttons": {}})
         with self.server.viser.atomic():
             self.server.viser.scene.reset()
             self.server.viser.gui.reset()
@@ -310,6 +316,7 @@ class Page:
             self.session.touch(arm, *hit, self._panel.press_depth * (DEEPER if deeper else 1.0))
 
     def _begin_search(self) -> None:
+        self.robot = self.robot_guess = None
         self.search.begin()
         self._panel.hide(self.search.seed)
         self._panel.show_lesions(False)
@@ -318,30 +325,53 @@ class Page:
         self.search.mark(chosen_lesions(self.session.anatomy, self.session.choice))
         self._panel.show_lesions(not self.search.open)
 
+    def _watch(self) -> None:
+        """Let the machine search for the same lesion."""
+        if self.search.guess is not None and self.robot is None:
+            self._panel.show_lesions(False)
+            self.felt.clear()
+            self.robot = RobotSearch(self.session)
+
+    def _move_robot(self) -> None:
+        robot = self.robot
+        if robot is None or robot.go_on():
+            return
+        assert robot.place is not None
+        self.robot = None
+        lesions = chosen_lesions(self.session.anatomy, self.session.choice)
+        self.robot_guess = self.search.rated(robot.place, robot.presses, robot.force_peak, lesions)
+        self._panel.show_lesions(True)
+
     def _overlay(self, frame: np.ndarray) -> dict[str, Any]:
-        """What `overlay.js` shows: force and limits [N], texts, the button and its packet, the tone."""
-        search, limits = self.search, self.session.scene.limits
-        text, button, sends = "", "Find the hidden lesion", SEARCH
+        """What `overlay.js` shows: force and limits [N], texts, buttons with their packets, the tone."""
+        search, robot, limits = self.search, self.robot, self.session.scene.limits
+        texts, buttons = [], {"Find the hidden lesion": SEARCH}
         if search.open:
-            text = f"{search.presses} presses: where is it stiffest?"
-            button, sends = "It is where I pressed last", MARK
+            texts.append(f"{search.presses} presses: where is it stiffest?")
+            buttons = {"It is where I pressed last": MARK}
         elif search.guess is not None:
-            guess = search.guess
-            effort = f"{guess.presses} presses, at most {guess.force_peak:.2f} N"
-            text = f"{1e3 * guess.error:.1f} mm from the lesion\n{effort}\n{guess.points} points of 100"
-            button = "Find another"
+            texts.append(f"You: {search.guess.text}")
+            buttons = {"Find another": SEARCH}
+            if robot is not None:
+                texts.append(f"Robot: {robot.presses} of {PRESSES} presses")
+            elif self.robot_guess is not None:
+                texts.append(f"Robot: {self.robot_guess.text}")
+            else:
+                buttons["Watch a robot search"] = WATCH
+        if HIDDEN not in lesion_kinds(self.session.scene):
+            buttons = {}
         return {
             "force": np.linalg.norm(frame["force"], axis=1).tolist(),
             "soft": limits.soft_force,
             "hard": limits.hard_force,
-            "text": text,
-            "button": button if HIDDEN in lesion_kinds(self.session.scene) else "",
-            "sends": sends.decode(),
+            "text": "\n".join(texts),
+            "buttons": {label: packet.decode() for label, packet in buttons.items()},
             "steer": STEERING,
             "tone": self._panel.tone,
         }
 
     def _reset(self) -> None:
+        self.robot = None
         self.session.park()
         self.session.ask(Reset())
 
@@ -361,10 +391,12 @@ class Page:
             session.ask(Change(choice))
         if int(frame["organ"]) != self._organ_number:
             self._organ_number = int(frame["organ"])
+            self.robot = None
             self.felt.clear()
             if self._shows_lesions:
                 self._show_lesions(True)
         self._feel()
+        self._move_robot()
         recording, begun = bool(frame["recording"]), int(frame["recordings"])
         if begun > self._recordings_written and not recording:
             self._recordings_written = begun
@@ -387,6 +419,9 @@ class Page:
                 self.felt.feel(row["tip"][arm], float(row["depth"][arm]), force)
                 if self.search.open:
                     self.search.feel(row["tip"][arm].copy(), force)
+            if self.robot is not None:
+                force = float(np.linalg.norm(row["force"][0]))
+                self.robot.feel(float(row["time"]), float(row["depth"][0]), force)
         self._traced = count
 
     def _show(self, frame: np.ndarray) -> None:
@@ -406,7 +441,9 @@ class Page:
     def _paint(self) -> None:
         """Update the paint; here, since calls of the panel come from other threads."""
         kind, tissue = self._chosen_paint, self._tissue
-        self._organ.paint(self.felt)
+        if time.monotonic() >= self._map_due:
+            self._map_due = time.monotonic() + MAP_PERIOD
+            self._organ.paint(self.felt)
         if not self._shares.done():
             return
         shares = self._shares.result()

@@ -1,6 +1,7 @@
 """The page's panel: buttons, sliders, plots, and a status text with the timing of the physics."""
 
 import html
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -23,6 +24,14 @@ PLOT_LEAST = {"N": 0.5, "mm": 4.0}
 TAXEL_LEAST = 0.01
 # Time without a motion of the sliders before a change applies [s].
 SETTLED = 0.35
+# Young's modulus of tissues of the breast [kPa] (Samani et al. 2007, under small deformation).
+TISSUES = {
+    "fat": 3.25,
+    "a fibroadenoma": 6.41,
+    "a low-grade carcinoma": 10.4,
+    "an intermediate-grade carcinoma": 20.0,
+    "a high-grade carcinoma": 42.5,
+}
 # Choices of the paint, with their names.
 PAINTS = {
     "none": NOTHING,
@@ -219,6 +228,7 @@ class Panel:
             "Hide another lesion", "draw one from the scene's ranges", lambda: self.hide(self.choice.seed + 1)
         )
         hide.visible = HIDDEN in kinds
+        self._names = gui.add_html(self._names_html(self._modulus.value))
         for control in (self._modulus, self._damping, self._ratio, self._size, self._lesions):
             control.on_update(lambda _: self._choose())
         self._show_lesions = self._checkbox("Show lesions", "show_lesions")
@@ -237,7 +247,14 @@ class Panel:
             lesion_size=self._size.value,
             seed=changes.get("seed", self.choice.seed),
         )
+        _set(self._names, "content", self._names_html(self._modulus.value))
         self._changed = time.monotonic()
+
+    def _names_html(self, modulus: float) -> str:
+        """Tissues of the breast as stiff as tissue of a modulus [kPa], and as its lesions."""
+        lesions = f", its lesions as {tissue_name(self._ratio.value * modulus)}"
+        text = f"stiff as {tissue_name(modulus)}{lesions if self._lesions.value in (SHOWN, HIDDEN) else ''}"
+        return f'<div style="padding:0 .9em .5em;font-size:.8em;opacity:.8">{text} (breast, Samani 2007)</div>'
 
     def _slider(self, label: str, low: float, high: float, step: float, start: float, unit: float = 1.0) -> Any:
         values = [round(value * unit, 6) for value in (low, high, step, start)]
@@ -253,6 +270,11 @@ class Panel:
         box = self._gui.add_checkbox(label, initial_value=initial_value, **options)
         box.on_update(lambda _: self._calls[name](box.value))
         return box
+
+
+def tissue_name(modulus: float) -> str:
+    """The tissue of TISSUES whose Young's modulus is nearest to one [kPa], by their ratio."""
+    return min(TISSUES, key=lambda name: abs(math.log(TISSUES[name] / modulus)))
 
 
 def _set(handle: Any, name: str, value: object) -> None:

@@ -217,6 +217,11 @@ class Session:
             if arm in self._touches:
                 self._touches[arm].held = False
 
+    def touches(self, arm: int) -> bool:
+        """True until a hand is back above the place of its touch."""
+        with self._lock:
+            return arm in self._touches
+
     def park(self) -> None:
         """Set all targets to the parked positions."""
         with self._lock:

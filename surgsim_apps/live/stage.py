@@ -59,15 +59,18 @@ DEPTH_SHARE = 0.35
 WIDTH, REACH = 0.55, 3.0
 # Least sum of weights of a felt node.
 WEIGHT_TINY, WEIGHT_LEAST, WEIGHT_MOST = 1e-3, 0.5, 1e6
-ORGAN_COLOUR, LESION_COLOUR = (158, 58, 50), (250, 214, 120)
+ORGAN_COLOUR, VESSEL_COLOUR, LESION_COLOUR = (158, 58, 50), (126, 38, 44), (250, 214, 120)
 # Contrast of the first and the last colour, relative to the lower quartile of the map; number of colours.
 CONTRASTS = (0.75, 2.25)
 LEVELS = 16
 TINY = 1e-9
 # Kinds of paint, beside the names of fields.
 STIFFNESS_MAP, NOTHING = "map", ""
-# Offset of the paint above the surface [m].
-PAINT_ABOVE = 0.0004
+# Offsets of the paint and of the vessels above the surface [m].
+PAINT_ABOVE, VESSELS_ABOVE = 0.0004, 0.0002
+# Vessels: number of waves of a field, mean wave length of their way and of their width in sizes of the organ, and mean
+# half width over the deviation of the first.
+VESSEL_WAVES, VESSEL_LENGTHS, VESSEL_WIDTH = 24, (0.25, 0.4), 0.05
 
 
 def page_camera(anatomy: Anatomy, *, upright: bool = False) -> Camera:
@@ -110,15 +113,14 @@ class Surroundings:
         self.directions = np.stack([right, level / np.linalg.norm(level), -anatomy.face.approach])
         self._scene = viser.scene
         self._cavity = _add_cavity(viser.scene, anatomy.mesh.points, camera.up, right)
-        viser.scene.set_background_image(_backdrop())
         self.show_plain(False)
 
     def show_plain(self, on: bool) -> None:
-        """Turn the greatest costs of a software renderer off or on: shadows, reflections, a glossy cavity."""
+        """Turn the greatest costs of a software renderer off or on: shadows, reflections, the cavity."""
         self._scene.configure_default_lights(enabled=True, cast_shadow=not on)
         self._scene.configure_environment_map(None if on else "warehouse", environment_intensity=0.6)
         self._scene.add_light_ambient("/ambient", intensity=AMBIENT if on else 0.0)
-        self._cavity.material = "toon3" if on else "standard"
+        self._cavity.visible = not on
 
 
 class FeltMap:
@@ -197,6 +199,9 @@ class OrganView:
         vertices, _ = self._rest = self._surface.follow(self._shown)
         faces = self._surface.faces.astype(np.uint32)
         self._organ = scene.add_mesh_simple("/organ", _scaled(vertices), faces, color=ORGAN_COLOUR, opacity=None)
+        self._vessels = _Paint(scene, "/vessels", VESSEL_COLOUR)
+        if anatomy.scene.mesh.block is None:
+            self._vessels.cover(*_vessels(vertices, self._surface.faces))
         self._paint = [_Paint(scene, f"/felt/{level}", colour) for level, colour in enumerate(_level_colours())]
         self._painted, self._fresh = -1, 1
         self.paints = STIFFNESS_MAP
@@ -209,6 +214,7 @@ class OrganView:
         self._fresh, self._shown = 0, node_position
         vertices, normals = self._surface.follow(node_position)
         self._organ.vertices = _scaled(vertices)
+        self._vessels.follow((vertices + VESSELS_ABOVE * normals) * SCALE)
         if self.paints:
             above = (vertices + PAINT_ABOVE * normals) * SCALE
             for paint in self._paint:
@@ -323,6 +329,26 @@ class _Paint:
                 if self._fresh:
                     self._node.faces = self._faces
         self._fresh = False
+
+
+def _vessels(vertices: FloatArray, faces: IntArray) -> tuple[csr_array, IntArray]:
+    """Strips of a surface's triangles about the zeros of a random field, as wide as another one.
+
+    Returns:
+        Mix of the surface's vertices for each new one, and the new triangles.
+    """
+    rng, size = np.random.default_rng(0), float(np.ptp(vertices, axis=0).max())
+
+    def field(length: float) -> FloatArray:
+        waves = rng.normal(size=(3, VESSEL_WAVES)) * 2.0 * math.pi / (length * size)
+        phases = rng.uniform(0.0, 2.0 * math.pi, VESSEL_WAVES)
+        return math.sqrt(2.0 / VESSEL_WAVES) * np.cos(vertices @ waves + phases).sum(axis=1)
+
+    way, width = (field(length) for length in VESSEL_LENGTHS)
+    width = VESSEL_WIDTH * (0.3 + width)
+    above, part = clip_triangles(faces, -width - way)
+    below, part = clip_triangles(part, above @ (way - width))
+    return below @ above, part
 
 
 def _level_colours() -> list[tuple[int, int, int]]:
@@ -551,10 +577,3 @@ def _add_cavity(scene: Any, points: FloatArray, up: FloatArray, right: FloatArra
         side="double",
         cast_shadow=False,
     )
-
-
-def _backdrop() -> NDArray[np.uint8]:
-    """Dark red, lighter in the middle, as light falls off in a body."""
-    y, x = np.mgrid[-1.0:1.0:90j, -1.0:1.0:160j]
-    fall = np.exp(-1.5 * (x**2 + y**2))[:, :, None]
-    return np.rint(np.array([18, 8, 9]) + fall * np.array([70, 24, 22])).astype(np.uint8)

@@ -156,6 +156,7 @@ def _compile_probe(scene: Scene, lower: FloatArray, upper: FloatArray) -> mujoco
     ball.size = [radius, 0.0, 0.0]
     start = radius + float(shaft.size[0])
     shaft.fromto = [0.0, 0.0, start, 0.0, 0.0, start + 0.1]
+    spec.geom("tip_handle").fromto = [0.0, 0.0, start + 0.1, 0.0, 0.0, start + 0.23]
     tip.quat = _rotation_from_down(np.asarray(scene.instrument.approach))
     for axis, name in enumerate(SLIDES):
         spec.joint(f"slide_{name}").range = [lower[axis], upper[axis]]

@@ -47,7 +47,9 @@ def test_the_robot_finds_a_hidden_lesion(seed, modulus_factor):
             force_peak = max(force_peak, session.felt.force)
     assert len(session.places) == robot.presses == PRESSES and robot.force_peak == force_peak
     assert len(np.unique(np.round(session.places, 6), axis=0)) == PRESSES
-    truth, _ = anatomy.face.project(chosen_lesions(anatomy, choice)[0].centre)
+    centre = chosen_lesions(anatomy, choice)[0].centre
+    assert centre is not None
+    truth, _ = anatomy.face.project(centre)
     assert robot.place is not None and np.linalg.norm(robot.place - truth) < 0.005
 
 

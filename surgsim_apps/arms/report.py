@@ -44,6 +44,8 @@ def write_report(
         ranking=ranking,
         ranking_rule=RANKING_RULE,
         number_text=number_text,
+        scene=evaluation.turning,
+        poster=(*pictures, *maps)[0],
         pictures=pictures,
         maps=maps,
         has_targets=evaluation.inner.any(),

@@ -1,10 +1,12 @@
 """Two arms at a point of an organ: a scene that turns, and with OpenGL a picture."""
 
+import math
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.arm_picture import filling_camera
@@ -13,10 +15,11 @@ from surgsim_apps.arms.reach import BothArms
 from surgsim_apps.arms.reach_kinds import PORT_COLOURS, REACH_KINDS, reach_kinds
 from surgsim_apps.arms.results import ArmsEvaluation
 from surgsim_apps.arms.wording import share_text
-from surgsim_apps.reports.surface_drawing import INK, OrthographicView, tube
+from surgsim_apps.reports.surface_drawing import INK, OrthographicView
 from surgsim_apps.reports.turning_scene import SolidPart, TurningScene, capsules_part, marks_part, turning_scene
 from surgsim_env.instruments import SIDES, Arm
 from surgsim_env.rendering import DrawnCapsule, draw_still
+from surgsim_env.scene import tangent_axes
 
 SIZE = 960, 720
 ORGAN, WALL = "#b8584a", "#d9a68c"
@@ -27,8 +30,8 @@ SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
 SCOPE_OUTSIDE, WALL_BEYOND = 0.18, 0.05
 # Field of view of the camera beside the table [degrees], and share of the arms in the picture.
 BESIDE_FOV, SHARE = 35.0, 0.85
-# Points with a mark in the scene, spread over the organ, and radius of a mark [m].
-MARKS_MOST, MARK_RADIUS = 1000, 0.0017
+# Points with a mark in the scene, spread over the organ, and radius of a mark over their usual spacing.
+MARKS_MOST, MARK_SHARE = 1000, 0.18
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,9 @@ class ArmsInPatient:
     ports: Ports
 
     @classmethod
-    def at_middle(cls, evaluation: ArmsEvaluation, arms: tuple[Arm, ...], both: BothArms, ports: Ports) -> "ArmsInPatient":
+    def at_middle(
+        cls, evaluation: ArmsEvaluation, arms: tuple[Arm, ...], both: BothArms, ports: Ports
+    ) -> "ArmsInPatient":
         """Both tips at a point that both reach at once, nearest to the middle of these; without one both at home."""
         rows = np.flatnonzero(both.reachable & ~evaluation.inner)
         if not rows.size:
@@ -87,21 +92,21 @@ class ArmsInPatient:
     def scene(self) -> TurningScene:
         """A scene that turns: organ, points in the colours of REACH_KINDS, arms as they are evaluated, ports, wall."""
         evaluation, parts = self.evaluation, []
+        spacing = KDTree(evaluation.points[:MARKS_MOST]).query(evaluation.points[:MARKS_MOST], k=2)[0][:, 1]
+        radius = MARK_SHARE * float(np.median(spacing))
         for index, kind in enumerate(REACH_KINDS):
             of_kind = reach_kinds(evaluation) == index
-            for name, rows, radius in (
-                (kind.name, np.flatnonzero(of_kind & ~evaluation.inner)[:MARKS_MOST], MARK_RADIUS),
-                (f"targets inside: {kind.name}", np.flatnonzero(of_kind & evaluation.inner), 2.0 * MARK_RADIUS),
+            for name, mask, size in (
+                (kind.name, of_kind & ~evaluation.inner & (np.arange(len(of_kind)) < MARKS_MOST), radius),
+                (f"{kind.name}, targets inside", of_kind & evaluation.inner, 2.0 * radius),
             ):
-                if rows.size:
-                    parts.append(marks_part(name, evaluation.points[rows], radius, kind.colour))
+                if mask.any():
+                    parts.append(marks_part(name, evaluation.points[mask], size, kind.colour))
         for side, arm, ends in zip(SIDES, self.arms, self._shape_ends(), strict=True):
             parts.append(capsules_part(f"{side} arm", ends, arm.shape_radius, PORT_COLOURS[side]))
         for name, ends, radius, colour in self._endoscope_and_ports():
             parts.append(capsules_part(name, [ends], [radius], colour))
-        parts.append(
-            SolidPart("organ", evaluation.surface_points, evaluation.surface_triangles, ORGAN, ORGAN_OPACITY)
-        )
+        parts.append(SolidPart("organ", evaluation.surface_points, evaluation.surface_triangles, ORGAN, ORGAN_OPACITY))
         if not self.ports.wall.plate:
             parts.append(self._dome())
         away, up = self._view()
@@ -110,18 +115,21 @@ class ArmsInPatient:
             (f"{kind.name}: {share_text(reach_kinds(evaluation)[outer] == index)}", kind.colour)
             for index, kind in enumerate(REACH_KINDS)
         ]
-        description = f"Both arms {self.where}, as the shapes that are evaluated, in the colours of what each reaches alone."
+        description = (
+            f"Both arms {self.where}, as the shapes that are evaluated, in the colours of what each reaches alone."
+        )
         return turning_scene(parts, view, description, legend)
 
     def _dome(self) -> SolidPart:
         """The part of the dome around the ports."""
-        centre = self.ports.dome_centre
-        points, triangles = tube(centre, centre, self.ports.wall.radius, rings=33, count=56)
-        middle = np.mean([port.point for port in self.evaluation.ports.values()], axis=0)
-        apart = max(np.linalg.norm(middle - port.point) for port in self.evaluation.ports.values())
-        shown = np.linalg.norm(points[triangles].mean(axis=1) - middle, axis=1) < apart + WALL_BEYOND
-        used, index = np.unique(triangles[shown], return_inverse=True)
-        return SolidPart("body wall", points[used], index.reshape(-1, 3).astype(np.int32), WALL, WALL_OPACITY)
+        from trimesh.creation import revolve
+
+        out, radius = self.ports.wall_normal, self.ports.wall.radius
+        beside = 0.5 * math.dist(self.ports.left.point, self.ports.right.point) + WALL_BEYOND
+        angle = np.linspace(math.asin(min(beside / radius, 1.0)), 0.0, 12)
+        cap = revolve(radius * np.stack([np.sin(angle), np.cos(angle)], axis=1), sections=64)
+        points = self.ports.dome_centre + cap.vertices @ np.stack([*tangent_axes(-out), out])
+        return SolidPart("body wall", points, np.asarray(cap.faces, dtype=np.int32), WALL, WALL_OPACITY)
 
     def _endoscope_and_ports(self) -> list[tuple[str, FloatArray, float, str]]:
         """Capsules: name, ends (2, 3) and radius [m], colour."""

@@ -119,9 +119,7 @@ def find_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles) -> 
     for place in np.eye(candidates.met.shape[1], dtype=bool):
         open_points = ~np.any(_every(clear), axis=1, keepdims=True)
         clear |= search.clear(candidates, candidates.met & open_points & place)
-    candidates, clear = search.with_directions(
-        candidates, clear, candidates.met, ~np.any(_every(clear), axis=1)
-    )
+    candidates, clear = search.with_directions(candidates, clear, candidates.met, ~np.any(_every(clear), axis=1))
     usable = _every(clear)
     widest = _widest(kinematics, candidates, usable)
     return Found(kinematics, candidates, usable, candidates.joints[np.arange(len(usable)), widest])

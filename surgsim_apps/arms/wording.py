@@ -41,8 +41,8 @@ def _shares(evaluation: ArmsEvaluation) -> str:
     both = evaluation.both[outer]
     grade = next((grade for grade, least in GRADES if both.mean() >= least), "Poor")
     shares = (
-        f"{grade} placement: of {int(outer.sum())} points on the surface of {evaluation.scene} that face the ports, the "
-        f"left arm reaches {left}, the right arm {right}, and both at once {share_text(both)}."
+        f"{grade} placement: of {int(outer.sum())} points on the surface of {evaluation.scene} that face the ports, "
+        f"the left arm reaches {left}, the right arm {right}, and both at once {share_text(both)}."
     )
     if not inner.any():
         return shares
@@ -55,9 +55,11 @@ def _limit(evaluation: ArmsEvaluation) -> str:
     apart = lost & evaluation.left.reachable & evaluation.right.reachable
     obstacles = [(apart, "the arms come too close to each other")]
     for side, arm in evaluation.arms.items():
-        obstacles += [(lost & (arm.reason == index), f"{side} arm: {REASONS[index]}") for index in range(1, len(REASONS))]
+        obstacles += [
+            (lost & (arm.reason == index), f"{REASONS[index]} ({side} arm)") for index in range(1, len(REASONS))
+        ]
     mask, words = max(obstacles, key=lambda obstacle: obstacle[0].sum())
-    return f"What limits most is: {words} ({share_text(mask[~evaluation.inner])})." if mask.any() else ""
+    return f"What limits most, at {share_text(mask[~evaluation.inner])} of them: {words}." if mask.any() else ""
 
 
 def _clearance(evaluation: ArmsEvaluation) -> str:
@@ -76,9 +78,13 @@ def _clearance(evaluation: ArmsEvaluation) -> str:
 def _next(evaluation: ArmsEvaluation) -> str:
     move = evaluation.move
     if move is None:
-        return "No move of one port by 1 or 2 cm along the body wall adds 1 %." if evaluation.moves_tried else ""
+        return (
+            "No move of one port by 1 or 2 cm along the body wall lets both reach 1 % more."
+            if evaluation.moves_tried
+            else ""
+        )
     before, after = (number_text(share, 100.0, 0) for share in (move.before, move.after))
     return (
-        f"Best next change: move the {move.side} port {move.words} in the camera's picture, along the body wall; both at "
-        f"once then reach {after} % instead of {before} %."
+        f"Best next change: move the {move.side} port {move.words} in the camera's picture, along the body wall; then "
+        f"both reach {after} % instead of {before} % (estimated by a quick search)."
     )

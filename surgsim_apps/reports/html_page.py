@@ -1,4 +1,4 @@
-"""Reports as single HTML files: nothing loaded from anywhere, pictures and a scene that turns embedded; for any browser.
+"""Reports as single HTML files: pictures and a scene that turns embedded, nothing loaded; for any browser.
 
 A report is a template in `templates/` that extends `base.html.j2`. It sets `title`, `verdict` (the first paragraph) and
 `sections`, a list of (id, heading, content); sections without content are left out. `parts.html.j2` has the macros for
@@ -52,9 +52,7 @@ class Picture:
         return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
 
 
-def render_page(
-    template: str, *, generator: str = "surgsim", scene: TurningScene | None = None, **values: Any
-) -> str:
+def render_page(template: str, *, generator: str = "surgsim", scene: TurningScene | None = None, **values: Any) -> str:
     """Text of a page: a template of `templates/` with its values; `generator` names its program.
 
     The browser runs no script but that of the scene.

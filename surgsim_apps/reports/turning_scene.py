@@ -65,7 +65,7 @@ class TurningScene:
 
 def capsules_part(name: str, ends: ArrayLike, radius: ArrayLike, colour: ArrayLike, opacity: float = 1.0) -> SolidPart:
     """Capsules with ends (n, 2, 3) and radii (n,) [m] as a part; of a ball both ends are the same."""
-    tubes = [tube(*each, float(size), rings=9, count=14) for each, size in zip(np.asarray(ends), np.asarray(radius))]
+    tubes = [tube(start, end, float(size), rings=9, count=14) for (start, end), size in zip(np.asarray(ends), np.asarray(radius))]
     first = np.cumsum([0, *(len(points) for points, _ in tubes)])
     points = np.concatenate([points for points, _ in tubes])
     triangles = np.concatenate([triangles + start for (_, triangles), start in zip(tubes, first)])
@@ -89,34 +89,39 @@ def turning_scene(
     import trimesh
     from trimesh.viewer import scene_to_html
 
-    places = np.concatenate([part.points for part in parts])
+    # Points of no triangle would count for the middle.
+    used = [np.unique(part.triangles, return_inverse=True) for part in parts]
+    places = np.concatenate([part.points[rows] for part, (rows, _) in zip(parts, used, strict=True)])
     # The viewer turns about the origin at first, with y up.
     axes = np.stack([view.right, view.up, view.towards])
     seen = places @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     scene = trimesh.Scene()
-    for part in parts:
-        scene.add_geometry(_mesh(part, part.points @ axes.T - middle), geom_name=part.name, node_name=part.name)
-    slope = math.tan(math.radians(0.5 * FOV_DEG))
-    x, y, z = (np.abs(seen - middle)).max(axis=0)
-    scene.set_camera((0.0, 0.0, 0.0), 1.05 * max(x / ASPECT, y) / slope + z, np.zeros(3), fov=(ASPECT * FOV_DEG, FOV_DEG))
+    for part, (rows, index) in zip(parts, used, strict=True):
+        colour = part.colour if isinstance(part.colour, str) else np.asarray(part.colour)[rows]
+        mesh = _mesh(part.points[rows] @ axes.T - middle, index.reshape(-1, 3).astype(np.int32), colour, part.opacity)
+        scene.add_geometry(mesh, geom_name=part.name, node_name=part.name)
+    # The nearest place from which all points are in the picture.
+    x, y, z = np.abs(seen - middle)[:, 0] / ASPECT, np.abs(seen - middle)[:, 1], (seen - middle)[:, 2]
+    distance = float((np.maximum(x, y) / math.tan(math.radians(0.48 * FOV_DEG)) + z).max())
+    scene.set_camera((0.0, 0.0, 0.0), distance, np.zeros(3), fov=(ASPECT * FOV_DEG, FOV_DEG))
     return TurningScene(description, scene_to_html(scene), tuple(legend))
 
 
-def _mesh(part: SolidPart, points: FloatArray) -> trimesh.Trimesh:
+def _mesh(points: FloatArray, triangles: IntArray, colour: str | FloatArray, opacity: float) -> trimesh.Trimesh:
     import trimesh
     from matplotlib.colors import to_rgb
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    one_colour = isinstance(part.colour, str)
-    base = [*(BRIGHTNESS * np.array(to_rgb(part.colour) if one_colour else np.ones(3))), part.opacity]
-    mode = "OPAQUE" if part.opacity == 1.0 else "BLEND"
+    base = [*(BRIGHTNESS * np.array(to_rgb(colour) if isinstance(colour, str) else np.ones(3))), opacity]
+    mode = "OPAQUE" if opacity == 1.0 else "BLEND"
     material = PBRMaterial(baseColorFactor=base, alphaMode=mode, metallicFactor=0.0, roughnessFactor=1.0)
-    mesh = trimesh.Trimesh(points, part.triangles, process=False, visual=TextureVisuals(material=material))
-    if not one_colour:
-        rgba = np.concatenate([part.colour, np.ones((len(points), 1))], axis=1)
-        mesh.visual.vertex_attributes["color"] = np.round(255.0 * rgba).astype(np.uint8)
+    visual = TextureVisuals(material=material)
+    if not isinstance(colour, str):
+        rgba = np.concatenate([colour, np.ones((len(points), 1))], axis=1)
+        visual.vertex_attributes["color"] = np.round(255.0 * rgba).astype(np.uint8)
+    mesh = trimesh.Trimesh(points, triangles, process=False, visual=visual)
     # Written with the mesh once they are computed; without them the viewer shows flat triangles.
     assert len(mesh.vertex_normals) == len(points)
     return mesh

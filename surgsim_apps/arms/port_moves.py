@@ -40,7 +40,7 @@ class PortSearch:
     organ: ClusteredSurface
     sites: Sites
 
-    def reach_from_port(self, side: str, ports: Ports, rows: NDArray[np.integer]) -> Found:
+    def reach_from_port(self, side: str, ports: Ports, rows: NDArray[np.integer], *, thorough: bool = False) -> Found:
         """Joint values of one arm at its port for some of the points.
 
         Raises:
@@ -49,7 +49,24 @@ class PortSearch:
         ports.check_outside(self.anatomy)
         radius = self.anatomy.scene.instrument.tip_radius
         kinematics = BatchKinematics(load_arm(self.arms[side], getattr(ports, side).port, tip_radius=radius))
-        return find_reach(kinematics, self.sites.only(rows), Obstacles(self.organ, ports, tip_ball(kinematics)))
+        around = Obstacles(self.organ, ports, tip_ball(kinematics))
+        return find_reach(kinematics, self.sites.only(rows), around, thorough=thorough)
+
+    def both_reach(
+        self, side: str, ports: Ports, found: Mapping[str, Found], rows: NDArray[np.integer]
+    ) -> NDArray[np.bool_]:
+        """Mask of some of the points in reach of both at once: one arm at its port, the other as found before."""
+
+        def together(among: NDArray[np.integer], thorough: bool) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+            arms = {name: arm.only(among) for name, arm in found.items()}
+            arms[side] = self.reach_from_port(side, ports, among, thorough=thorough)
+            reached = evaluate_both(arms["left"], arms["right"], self.sites.points[among]).reachable
+            return reached, arms["left"].reachable & arms["right"].reachable & ~reached
+
+        reached, close = together(rows, thorough=False)
+        if close.any():
+            reached[close] = together(rows[close], thorough=True)[0]
+        return reached
 
     def best_move(
         self, ports: Ports, found: Mapping[str, Found], both: NDArray[np.bool_], view: OrthographicView
@@ -57,7 +74,7 @@ class PortSearch:
         """The move of one port that adds most to the surface's points that both arms reach at once.
 
         Each move is tried at a sample: the points that both do not reach yet as far as half of it, and spread ones. The
-        best is confirmed at all points.
+        best is confirmed at all points. The other arm stays as it was found.
 
         Args:
             ports: before the move.
@@ -74,25 +91,21 @@ class PortSearch:
         rows = np.concatenate([first, had[: SAMPLE - len(first)]])
         # Each point of the sample stands for as many of its kind.
         weight = np.where(both[rows], len(had) / max(len(rows) - len(first), 1), len(missing) / max(len(first), 1))
-        before = float(both[surface].mean())
-        tried = []
+        least = float(both[surface].mean()) + GAIN_LEAST
+        best = None
         for side, words, shift in port_shifts(ports, view):
             try:
                 moved = moved_port(ports, side, shift)
-                arms = {**{name: arm.only(rows) for name, arm in found.items()}}
-                arms[side] = self.reach_from_port(side, moved, rows)
+                estimate = float(weight @ self.both_reach(side, moved, found, rows)) / len(surface)
             except ValueError:
                 continue  # inside the organ, or too far from the other port
-            reached = evaluate_both(arms["left"], arms["right"], self.sites.points[rows]).reachable
-            tried.append((float(weight @ reached) / len(surface), side, words, shift, moved))
-        if not tried:
+            if estimate > (best[0] if best else least):
+                best = estimate, side, words, shift
+        if best is None:
             return None
-        estimate, side, words, shift, moved = max(tried, key=lambda each: each[0])
-        if estimate < before + GAIN_LEAST:
-            return None
-        left, right = (self.reach_from_port(each, moved, surface) for each in SIDES)
-        after = float(evaluate_both(left, right, self.sites.points[surface]).reachable.mean())
-        return PortMove(side, words, shift, before, after) if after >= before + GAIN_LEAST else None
+        _, side, words, shift = best
+        after = float(self.both_reach(side, moved_port(ports, side, shift), found, surface).mean())
+        return PortMove(side, words, shift, least - GAIN_LEAST, after) if after >= least else None
 
 
 def moved_port(ports: Ports, side: str, shift: FloatArray) -> Ports:

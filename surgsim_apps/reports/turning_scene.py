@@ -65,7 +65,10 @@ class TurningScene:
 
 def capsules_part(name: str, ends: ArrayLike, radius: ArrayLike, colour: ArrayLike, opacity: float = 1.0) -> SolidPart:
     """Capsules with ends (n, 2, 3) and radii (n,) [m] as a part; of a ball both ends are the same."""
-    tubes = [tube(start, end, float(size), rings=9, count=14) for (start, end), size in zip(np.asarray(ends), np.asarray(radius))]
+    tubes = [
+        tube(start, end, float(size), rings=9, count=14)
+        for (start, end), size in zip(np.asarray(ends), np.asarray(radius))
+    ]
     first = np.cumsum([0, *(len(points) for points, _ in tubes)])
     points = np.concatenate([points for points, _ in tubes])
     triangles = np.concatenate([triangles + start for (_, triangles), start in zip(tubes, first)])

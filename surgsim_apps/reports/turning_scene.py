@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -55,12 +52,6 @@ class TurningScene:
     description: str
     html: str
     legend: tuple[tuple[str, str], ...]
-
-    @property
-    def script_hash(self) -> str:
-        """The document's script, as a source of a content security policy."""
-        (script,) = re.findall("<script>(.*?)</script>", self.html, flags=re.S)
-        return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode('ascii')}'"
 
 
 def capsules_part(name: str, ends: ArrayLike, radius: ArrayLike, colour: ArrayLike, opacity: float = 1.0) -> SolidPart:

@@ -12,7 +12,7 @@ from matplotlib.image import imread
 from surgsim_apps.arms.pictures import ArmMaps, write_picture
 from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.report import write_report
-from surgsim_apps.reports.html_page import POLICY
+from surgsim_apps.reports.html_page import POLICY, SCENE_POLICY
 from surgsim_apps.reports.surface_drawing import OrthographicView
 from surgsim_apps.reports.turning_scene import SolidPart, turning_scene
 from tests.arms.made import made_evaluation
@@ -83,7 +83,7 @@ def test_a_page_with_a_fault_is_noticed(report, tmp_path, shown):
 @pytest.mark.parametrize("width", [1280, 500])
 def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, shown, width):
     text = report.read_text(encoding="utf-8")
-    assert f'<meta http-equiv="Content-Security-Policy" content="{POLICY}; connect-src data:; script-src ' in text
+    assert f'<meta http-equiv="Content-Security-Policy" content="{POLICY}{SCENE_POLICY}">' in text
     browser = shown(report, width)
     made = browser.run(MADE)
     assert browser.complaints() == []

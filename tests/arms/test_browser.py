@@ -95,7 +95,7 @@ def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, s
 
 def test_the_scene_turns(report, shown):
     """It is drawn, by the page's one script, and again from another side after a drag."""
-    browser = shown(report)
+    browser = shown(report, 1280, 1600)
     box = browser.run(
         "(() => { const r = document.querySelector('iframe').getBoundingClientRect();"
         " return [r.x + r.width / 2, r.y + r.height / 2]; })()"

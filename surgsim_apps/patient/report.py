@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msdm_core.arithmetic import matmul
+from msdm_core.arithmetic import dot, matmul
 from msdm_core.material import Lesion, lesion_extent
 from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality, outer_faces, surface_carriers
 from msdm_core.organ import compile_organ, stable_dt
@@ -222,7 +222,7 @@ def organ_scene(organ: PatientScene) -> TurningScene:
     ]
     legend = [*((name, to_hex(colour.tolist())) for name, colour in named), (f"{len(sites)} sites to press", INK)]
     approach, up = np.array(organ.scene.instrument.approach), np.array(organ.scene.cranial)
-    upright = up if abs(approach @ up) < 0.9 else None
+    upright = up if abs(dot(approach, up)) < 0.9 else None
     return turning_scene(
         parts, OrthographicView.along(approach, upright), "The organ as the probe approaches it.", legend
     )

@@ -18,8 +18,8 @@ CLUSTER_SIZE = 24
 PAIRS_AT_ONCE = 400_000
 # Parts of an arm this near to the tip (and its ball) may touch the organ [m].
 TIP_ZONE = 0.005
-# Parts of two arms this near to a common point are left out of their distance [m]: their tips meet.
-MEETING_ZONE = 0.020
+# Parts this near to the tip work on the organ, or on the other arm's tip: their contact is no lack of clearance [m].
+WORKING_ZONE = 0.020
 
 
 def segment_distance(first: ArrayLike, second: ArrayLike) -> FloatArray:
@@ -180,15 +180,19 @@ class Obstacles:
     ports: Ports
     ball: float
 
-    def organ_clearance(self, kinematics: BatchKinematics, chain: Chain, *, exact: bool) -> FloatArray:
-        """Distance of all shapes outside the tip's zone from the organ [m], (n,).
+    def clears_organ(self, kinematics: BatchKinematics, chain: Chain) -> NDArray[np.bool_]:
+        """Mask of poses that touch the organ with the tip's zone alone, (n,)."""
+        cap = float(kinematics.arm.shape_radius.max())
+        return self._organ_gap(kinematics, chain, TIP_ZONE, cap) >= 0.0
 
-        Not exact: 0 or more means clear, less means touching.
-        """
+    def organ_clearance(self, kinematics: BatchKinematics, chain: Chain) -> FloatArray:
+        """Distance of shaft and links, the tool's working zone left out, from the organ [m], (n,)."""
+        return self._organ_gap(kinematics, chain, WORKING_ZONE)
+
+    def _organ_gap(self, kinematics: BatchKinematics, chain: Chain, zone: float, cap: float = np.inf) -> FloatArray:
         radius = kinematics.arm.shape_radius
-        parts, left = outside_ball(chain.shape_ends, chain.tip[:, None], self.ball + TIP_ZONE)
+        parts, left = outside_ball(chain.shape_ends, chain.tip[:, None], self.ball + zone)
         row, shape, part = np.nonzero(left)
-        cap = np.inf if exact else float(radius.max())
         gaps = self.organ.distance(parts[row, shape, part], cap) - radius[shape]
         result = np.full(chain.shape_ends.shape[:2], np.inf)
         np.minimum.at(result, (row, shape), gaps)
@@ -246,14 +250,14 @@ def arm_distances(
 ) -> tuple[FloatArray, FloatArray]:
     """Smallest distances of two arms inside and outside the body [m], each (n,), their tips at the same points (n, 3).
 
-    Each arm's own trocar divides its shapes into inside and outside; parts within MEETING_ZONE of the
+    Each arm's own trocar divides its shapes into inside and outside; parts within WORKING_ZONE of the
     point are left out.
     """
     pieces = [split_at_trocar(*first), split_at_trocar(*second)]
     radii = [first[0].arm.shape_radius, second[0].arm.shape_radius]
     inside = []
     for segments, _ in pieces:
-        parts, left = outside_ball(segments, points[:, None], MEETING_ZONE)
+        parts, left = outside_ball(segments, points[:, None], WORKING_ZONE)
         parts[~left] = np.nan
         inside.append(parts.reshape(len(segments), -1, 2, 3))
     outside = [piece[1] for piece in pieces]

@@ -59,6 +59,10 @@ class Candidates:
         """Mask of candidates with the tip at its point and the shaft in its trocar, (n, k)."""
         return (self.position_error <= REACHED) & (self.trocar_error <= REACHED)
 
+    def only(self, rows: NDArray) -> "Candidates":
+        """Those of some of the points."""
+        return Candidates(*(values[rows] for values in vars(self).values()))
+
     def add(self, other: "Candidates") -> "Candidates":
         """Both, side by side."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)

@@ -1,21 +1,18 @@
-"""Heat maps of two arms on an organ's surface, and with OpenGL a picture of both at home."""
+"""Heat maps of two arms on an organ's surface."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
-from surgsim_apps.arms.arm_picture import filling_camera
-from surgsim_apps.arms.ports import Ports
 from surgsim_apps.arms.quantities import QUANTITIES, Quantity
+from surgsim_apps.arms.reach_kinds import PORT_COLOURS, REACH_KINDS, reach_kinds
 from surgsim_apps.arms.results import ArmsEvaluation
 from surgsim_apps.arms.wording import share_text
 from surgsim_apps.reports.html_page import Picture
@@ -28,22 +25,19 @@ from surgsim_apps.reports.surface_drawing import (
     draw_patches,
     save_png,
 )
-from surgsim_env.instruments import Arm
-from surgsim_env.rendering import DrawnCapsule, draw_still
 from surgsim_env.step_progress import StepProgress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
 
-# Distinct for all kinds of colour blindness: viridis, which contains no grey, and Okabe & Ito's colours.
+# Distinct for all kinds of colour blindness, and without grey.
 COLOUR_MAP = "viridis"
-LEFT, RIGHT, BOTH, APART, NEITHER = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#bdbdbd"
+NEITHER = REACH_KINDS[-1].colour
 # Colour of parts without a tried point.
 UNTRIED = "#f4e6de"
 # Largest distance of a tried part of the organ from a point, over the points' usual spacing.
 TRIED_WITHIN = 2.0
-PORT_MARKS = {"left": ("L", LEFT), "right": ("R", RIGHT), "endoscope": ("E", INK)}
 SPLITS = 2
 NEIGHBOURS = 4
 # Extra distance between points with normals at a right angle, as a share of the organ's size: values of one side do not
@@ -55,13 +49,6 @@ FLATNESS = 0.6
 
 # Of a map: title, mask of points with a value, and the values [SI].
 Panel = tuple[str, NDArray[np.bool_], FloatArray]
-SIZE = 960, 720
-SCOPE, PORT, WALL = (0.36, 0.39, 0.44, 1.0), (0.95, 0.75, 0.2, 1.0), (0.85, 0.65, 0.55, 0.18)
-SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
-# Length of the drawn endoscope outside its port [m].
-SCOPE_OUTSIDE = 0.18
-# Field of view of the camera beside the table [degrees], and share of the arms in the picture.
-BESIDE_FOV, SHARE = 35.0, 0.85
 
 
 class ArmMaps:
@@ -102,17 +89,12 @@ class ArmMaps:
         from matplotlib.figure import Figure
         from matplotlib.lines import Line2D
 
-        evaluation = self.evaluation
-        left, right = evaluation.left.reachable, evaluation.right.reachable
-        either = np.where(left, np.where(right, 2, 0), np.where(right, 1, 3))
-        # Each arm reaches the point alone, but the arms would come too close.
-        kind = np.where((either == 2) & ~evaluation.both, 4, either)
-        palette = np.array([to_rgb(colour) for colour in (LEFT, RIGHT, BOTH, NEITHER, APART)])
-        names = ("left arm only", "right arm only", "both at once", "neither", "each, but not both at once")
+        kind = reach_kinds(self.evaluation)
+        palette = np.array([to_rgb(each.colour) for each in REACH_KINDS])
         figure = Figure(figsize=(7.5, 4.2), dpi=DPI, facecolor=PAPER, layout="constrained")
         self._draw(figure.subplots(), palette[kind[self._nearest[:, 0]]], palette[kind], "from the camera")
-        shown = [index for index in (2, 0, 1, 4, 3) if (kind == index).any()]
-        labels = [f"{names[index]}: {share_text(kind[self._surface] == index)}" for index in shown]
+        shown = [index for index in range(len(REACH_KINDS)) if (kind == index).any()]
+        labels = [f"{REACH_KINDS[index].name}: {share_text(kind[self._surface] == index)}" for index in shown]
         handles = [
             Line2D([], [], marker="s", ls="", ms=10, color=palette[index], label=label)
             for index, label in zip(shown, labels, strict=True)
@@ -206,12 +188,9 @@ def camera_view(evaluation: ArmsEvaluation) -> OrthographicView:
 def _mark_ports(axes: Axes, evaluation: ArmsEvaluation, view: OrthographicView) -> None:
     """Each port as a letter in a disc."""
     for name, port in evaluation.ports.items():
-        letter, colour = PORT_MARKS[name]
-        place = view.flat(np.array([port.point]))[0]
-        axes.plot(*place, "o", ms=12, color=colour, mec="white", mew=1.2, zorder=5)
-        axes.text(
-            place[0], place[1], letter, color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6
-        )
+        x, y = view.flat(np.array([port.point]))[0]
+        axes.plot(x, y, "o", ms=12, color=PORT_COLOURS[name], mec="white", mew=1.2, zorder=5)
+        axes.text(x, y, name[0].upper(), color="white", fontsize=8, weight="bold", ha="center", va="center", zorder=6)
 
 
 def _norm(panels: list[Panel], scale: float) -> Normalize:
@@ -223,37 +202,9 @@ def _norm(panels: list[Panel], scale: float) -> Normalize:
     return Normalize(least, most if most > least else least + 1.0)
 
 
-def draw_arms(evaluation: ArmsEvaluation, arms: Sequence[Arm], ports: Ports) -> NDArray[np.uint8]:
-    """A picture (720, 960, 3) of the arms at home in their ports, from beside the table.
-
-    Raises:
-        NoGLError: there is no OpenGL; names what is missing.
-    """
-    posed = [(arm.model, mujoco.MjData(arm.model)) for arm in arms]
-    for arm, (model, data) in zip(arms, posed, strict=True):
-        arm.write(data, arm.home)
-        mujoco.mj_kinematics(model, data)
-    capsules = [DrawnCapsule(np.array([port.point] * 2), PORT_RADIUS, PORT) for port in evaluation.ports.values()]
-    scope = evaluation.ports["endoscope"]
-    point, into = np.array(scope.point), np.array(scope.into) / np.linalg.norm(scope.into)
-    capsules.append(DrawnCapsule(np.stack([point - SCOPE_OUTSIDE * into, point]), SCOPE_RADIUS, SCOPE))
-    if not ports.wall.plate:
-        capsules.append(DrawnCapsule(np.stack([ports.dome_centre] * 2), ports.wall.radius, WALL))
-    ends = np.concatenate([arm.shape_ends(arm.home).reshape(-1, 3) for arm in arms])
-    line, up = np.array(ports.right.point) - np.array(ports.left.point), ports.wall_normal
-    away = np.cross(line, up) / np.linalg.norm(line)
-    # From the side away from the arms' bases.
-    if (ends.mean(axis=0) - evaluation.surface_points.mean(axis=0)) @ away > 0.0:
-        away = -away
-    seen = np.concatenate([ends, evaluation.surface_points])
-    camera = filling_camera(seen, 0.88 * away + 0.48 * up, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
-    surface = evaluation.surface_points, evaluation.surface_triangles
-    return draw_still(surface, posed, capsules, [camera], SIZE)[0]
-
-
 def write_picture(image: NDArray[np.uint8], path: Path) -> Picture:
     """Write the picture of the arms as a PNG file."""
     from matplotlib.image import imsave
 
     imsave(path, np.ascontiguousarray(image), format="png")
-    return Picture.of_file(path, "The arms at their ports", "Both arms at home, the endoscope, the ports and the wall.")
+    return Picture.of_file(path, "The arms at their ports", "Both arms, the endoscope, the ports and the wall.")

@@ -53,9 +53,9 @@ QUANTITIES = (
     Quantity("tip_force", "tip force", "N", 1.0, 2, "_N", True,
              "Largest static force of the tip along the inward normal of the surface within the joints' torque and "
              "force limits, at the joints found, with gravity compensated and no load on the trocar."),
-    Quantity("organ_clearance", "clearance from the organ", "mm", 1e3, 1, "_m", True,
-             "Smallest distance between the arm's surface and the organ at rest; the tip's ball and 5 mm about it "
-             "are left out."),
+    Quantity("organ_clearance", "clearance of shaft and links from the organ", "mm", 1e3, 1, "_m", True,
+             "Smallest distance between the arm's surface and the organ at rest, without the contact on purpose: the "
+             "tip's ball and 20 mm about it, where the tool works, are left out."),
     Quantity("wall_clearance", "clearance from the body wall", "mm", 1e3, 1, "_m", True,
              "Smallest distance between the arm's surface and the body wall, a dome or plate through the ports; "
              "parts in the hole about the arm's own port are left out."),
@@ -78,7 +78,7 @@ QUANTITIES = (
     Quantity("camera_angle", "angle to the camera", "degrees", 180.0 / math.pi, 0, "_rad", True,
              "Angle between the instrument's shaft and the line of sight from the endoscope's port to the point: "
              "at a small angle the shaft hides what the tip does."),
-    Quantity("position_error", "tip error", "mm", 1e3, 3, "_m", False,
+    Quantity("position_error", "contact on purpose: tip from its point", "mm", 1e3, 3, "_m", False,
              "Distance between the point and the tip at the joints found."),
     Quantity("trocar_error", "trocar error", "mm", 1e3, 3, "_m", False,
              "Distance between the shaft's axis and the trocar at the joints found."),

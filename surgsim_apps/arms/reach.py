@@ -40,19 +40,46 @@ class Sites:
     normals: FloatArray
     inner: NDArray[np.bool_]
 
+    def only(self, rows: NDArray) -> "Sites":
+        """Some of them."""
+        return Sites(self.points[rows], self.normals[rows], self.inner[rows])
+
     def tips(self, ball: float) -> FloatArray:
         """Places of a tip with its ball [m] on the surface; an inner target itself, (n, 3)."""
         return self.points + np.where(self.inner, 0.0, ball)[:, None] * self.normals
 
 
 @dataclass(frozen=True)
-class Reach:
-    """Reach of an arm: its report, all candidates, and a mask of usable ones, past every test (n, k)."""
+class Found:
+    """Joint values of an arm for n points.
 
-    report: ArmReach
+    Fields:
+        kinematics: of the arm
+        candidates: k for each point
+        usable: mask of those past every test                           (n, k)
+        joints: of the usable one furthest from limits [rad or m]       (n, n_joint)
+    """
+
     kinematics: BatchKinematics
     candidates: Candidates
     usable: NDArray[np.bool_]
+    joints: FloatArray
+
+    @property
+    def reachable(self) -> NDArray[np.bool_]:
+        """Mask of points in reach, (n,)."""
+        return np.any(self.usable, axis=1)
+
+    def only(self, rows: NDArray) -> "Found":
+        """Some of the points."""
+        return Found(self.kinematics, self.candidates.only(rows), self.usable[rows], self.joints[rows])
+
+
+@dataclass(frozen=True)
+class Reach(Found):
+    """Joint values of an arm, and its report."""
+
+    report: ArmReach
 
 
 def tip_ball(kinematics: BatchKinematics) -> float:
@@ -74,6 +101,33 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles)
     limits and trocar and clears organ and wall. The reported joints are those of the usable candidate furthest from
     the joint limits.
     """
+    search, candidates = _begin(kinematics, sites, around)
+    candidates, clear = search.all_around(candidates, search.clear(candidates, candidates.met))
+    usable = _every(clear)
+    report = _report(search, candidates, usable, _reasons(search, candidates, clear))
+    return Reach(kinematics, candidates, usable, report.joints, report)
+
+
+def find_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles, *, thorough: bool = False) -> Found:
+    """Joint values of one arm for every site, by a search that ends at the first usable ones of each.
+
+    It takes a twentieth of the time of `evaluate_reach`, for the same points in reach (but for those that only a second
+    round of directions finds: none of 1500 on the liver). A thorough search goes on to all directions at every site.
+    """
+    search, candidates = _begin(kinematics, sites, around)
+    clear = np.zeros((3, *candidates.met.shape), dtype=bool)
+    for place in np.eye(candidates.met.shape[1], dtype=bool):
+        open_points = ~np.any(_every(clear), axis=1, keepdims=True)
+        clear |= search.clear(candidates, candidates.met & open_points & place)
+    wanted = thorough | ~np.any(_every(clear), axis=1)
+    candidates, clear = search.with_directions(candidates, clear, candidates.met, wanted)
+    usable = _every(clear)
+    widest = _widest(kinematics, candidates, usable)
+    return Found(kinematics, candidates, usable, candidates.joints[np.arange(len(usable)), widest])
+
+
+def _begin(kinematics: BatchKinematics, sites: Sites, around: Obstacles) -> tuple["_Search", Candidates]:
+    """A search, and candidates from spread starts and from neighbours."""
     ports = around.ports
     directions = approach_directions(
         sites.normals,
@@ -82,12 +136,12 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles)
     )
     search = _Search(kinematics, sites, around, sites.tips(around.ball), directions)
     candidates = from_starts(kinematics, search.tips, spread_starts(kinematics))
-    candidates = from_neighbours(kinematics, search.tips, candidates)
-    candidates, clear = search.all_around(candidates, search.clear(candidates))
-    usable = _every(clear)
-    reason = _reasons(search, candidates, clear)
-    report = _report(search, candidates, usable, reason)
-    return Reach(report, kinematics, candidates, usable)
+    return search, from_neighbours(kinematics, search.tips, candidates)
+
+
+def _widest(kinematics: BatchKinematics, candidates: Candidates, usable: NDArray[np.bool_]) -> IntArray:
+    """Index of the usable candidate of each point that is furthest from joint limits, (n,)."""
+    return np.where(usable, limit_margin(kinematics, candidates.joints), -np.inf).argmax(axis=1).astype(np.int32)
 
 
 @dataclass(frozen=True)
@@ -107,34 +161,33 @@ class _Search:
                 # Without a usable one, the second round too begins at any candidate at the point.
                 usable = _every(clear)
                 begin = np.where(np.any(usable, axis=1, keepdims=True), usable, candidates.met)
-            lacking = ~directions_met(candidates.pointing, _every(clear), self.directions)
-            wanted = lacking & np.any(candidates.met, axis=1, keepdims=True)
-            rows = np.flatnonzero(np.any(wanted, axis=1))
-            added = _empty_like(candidates, self.directions.shape[1])
-            if rows.size:
-                directions, tips = self.directions[rows], self.tips[rows]
-                part = from_directions(
-                    self.kinematics,
-                    tips,
-                    directions,
-                    Candidates(*(values[rows] for values in vars(candidates).values())),
-                    begin[rows],
-                )
-                for name in vars(added):
-                    getattr(added, name)[rows] = getattr(part, name)
-            clear = np.concatenate([clear, self.clear(added)], axis=2)
-            candidates = candidates.add(added)
+            lacking = ~directions_met(candidates.pointing, _every(clear), self.directions).all(axis=1)
+            candidates, clear = self.with_directions(candidates, clear, begin, lacking)
         return candidates, clear
 
-    def clear(self, candidates: Candidates) -> NDArray[np.bool_]:
-        """Masks of candidates at their point, and of these clear of the organ, and of the wall: (3, n, k)."""
-        result = np.zeros((3, *candidates.met.shape), dtype=bool)
-        result[0] = candidates.met
-        points, places = np.nonzero(candidates.met)
+    def with_directions(
+        self, candidates: Candidates, clear: NDArray[np.bool_], begin: NDArray[np.bool_], wanted: NDArray[np.bool_]
+    ) -> tuple[Candidates, NDArray[np.bool_]]:
+        """Further candidates of wanted points (n,) from every direction, begun at a mask of those there are (n, k)."""
+        rows = np.flatnonzero(wanted & np.any(candidates.met, axis=1))
+        added = _empty_like(candidates, self.directions.shape[1])
+        if rows.size:
+            part = from_directions(
+                self.kinematics, self.tips[rows], self.directions[rows], candidates.only(rows), begin[rows]
+            )
+            for name in vars(added):
+                getattr(added, name)[rows] = getattr(part, name)
+        return candidates.add(added), np.concatenate([clear, self.clear(added, added.met)], axis=2)
+
+    def clear(self, candidates: Candidates, tried: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Masks of tried candidates (n, k): all, those clear of the organ, and those clear of the wall, (3, n, k)."""
+        result = np.zeros((3, *tried.shape), dtype=bool)
+        result[0] = tried
+        points, places = np.nonzero(tried)
         for low in range(0, len(points), CANDIDATES_AT_ONCE):
             point, place = points[low : low + CANDIDATES_AT_ONCE], places[low : low + CANDIDATES_AT_ONCE]
             chain = self.kinematics.at(candidates.joints[point, place])
-            off_organ = self.around.organ_clearance(self.kinematics, chain, exact=False) >= 0.0
+            off_organ = self.around.clears_organ(self.kinematics, chain)
             result[1, point, place] = off_organ | self.sites.inner[point]
             result[2, point, place] = self.around.wall_clearance(self.kinematics, chain) >= 0.0
         return result
@@ -175,16 +228,15 @@ def _reasons(search: _Search, candidates: Candidates, clear: NDArray[np.bool_]) 
 def _report(search: _Search, candidates: Candidates, usable: NDArray[np.bool_], reason: IntArray) -> ArmReach:
     kinematics, sites, around = search.kinematics, search.sites, search.around
     rows, good = np.arange(len(reason)), reason == 0
-    worth = np.where(usable, limit_margin(kinematics, candidates.joints), -np.inf)
     nearest = np.argmin(candidates.position_error + candidates.trocar_error, axis=1)
-    best = np.where(good, worth.argmax(axis=1), nearest)
+    best = np.where(good, _widest(kinematics, candidates, usable), nearest)
     joints = candidates.joints[rows, best]
     chain = kinematics.at(joints)
     values = scaled_singular_values(kinematics, chain)
     organ = np.full(len(rows), np.nan)
     outer = np.flatnonzero(good & ~sites.inner)
     if outer.size:
-        organ[outer] = around.organ_clearance(kinematics, kinematics.at(joints[outer]), exact=True)
+        organ[outer] = around.organ_clearance(kinematics, kinematics.at(joints[outer]))
 
     def where_reached(quantity: FloatArray) -> FloatArray:
         return np.where(good & np.isfinite(quantity), quantity, np.nan)
@@ -223,11 +275,11 @@ class BothArms:
     joints: tuple[FloatArray, FloatArray]
 
 
-def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
+def evaluate_both(left: Found, right: Found, points: FloatArray) -> BothArms:
     """Points in reach of both arms at once: with the reported joints, else with the best of 6 x 6 other pairs."""
     inside, outside = np.full(len(points), np.nan), np.full(len(points), np.nan)
-    joints = left.report.joints.copy(), right.report.joints.copy()
-    rows = np.flatnonzero(left.report.reachable & right.report.reachable)
+    joints = left.joints.copy(), right.joints.copy()
+    rows = np.flatnonzero(left.reachable & right.reachable)
     if rows.size:
         kinematics = left.kinematics, right.kinematics
         inside[rows], outside[rows] = pair_distances(kinematics, (joints[0][rows], joints[1][rows]), points[rows])
@@ -246,7 +298,7 @@ def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
         return BothArms(np.minimum(inside, outside) >= ARM_DISTANCE, inside, outside, joints)
 
 
-def ways(arm: Reach, rows: NDArray) -> FloatArray:
+def ways(arm: Found, rows: NDArray) -> FloatArray:
     """Joint values of usable candidates, the furthest from limits to the nearest, (len(rows), WAYS, n_joint)."""
     usable = arm.usable[rows]
     margin = np.where(usable, limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.quantities import DISTANCES, QUANTITIES, spread
 from surgsim_apps.arms.ranking import RANKING_RULE, Ranked
+from surgsim_apps.arms.reach_kinds import PORT_COLOURS, REACH_KINDS
 from surgsim_apps.arms.results import REASONS, ArmsEvaluation, ThroughCycle
 from surgsim_apps.arms.wording import number_text, share_text, verdict
 from surgsim_apps.reports.html_page import Picture, render_page
@@ -44,8 +45,11 @@ def write_report(
         ranking=ranking,
         ranking_rule=RANKING_RULE,
         number_text=number_text,
+        scene=evaluation.turning,
+        poster=(*pictures, *maps)[0],
         pictures=pictures,
         maps=maps,
+        colours={**PORT_COLOURS, "both": REACH_KINDS[0].colour},
         has_targets=evaluation.inner.any(),
         shares=_shares(evaluation),
         values=_values(evaluation),

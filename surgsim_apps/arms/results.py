@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray, IntArray
+from surgsim_apps.reports.turning_scene import TurningScene
 from surgsim_env.instruments import SIDES
 from surgsim_env.scene import Port
 
@@ -116,6 +117,24 @@ class ThroughCycle:
 
 
 @dataclass(frozen=True)
+class PortMove:
+    """A move of one port that lets both arms reach more.
+
+    Fields:
+        side: of the port
+        words: length and direction, as the endoscope's picture shows it
+        shift: along the body wall [m]                                               (3,)
+        before, after: share of the surface's points that both arms reach at once
+    """
+
+    side: str
+    words: str
+    shift: FloatArray
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
 class ArmsEvaluation:
     """Both arms on one scene.
 
@@ -130,7 +149,10 @@ class ArmsEvaluation:
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
         ports: of the arms ("left", "right") and the camera ("endoscope")
         cycle: both arms while the patient breathes; None for a motionless one
+        move: of a port, that lets both reach more; None where no move is worth it, or none was tried
+        moves_tried: True if moves of the ports were tried
         picture: of the arms in the patient, RGB, (height, width, 3) uint8; None without one
+        turning: scene of the arms in the patient; None without one
     """
 
     points: FloatArray
@@ -146,7 +168,10 @@ class ArmsEvaluation:
     surface_triangles: IntArray
     ports: Mapping[str, Port]
     cycle: ThroughCycle | None = None
+    move: PortMove | None = None
+    moves_tried: bool = False
     picture: NDArray[np.uint8] | None = None
+    turning: TurningScene | None = None
 
     @property
     def arms(self) -> dict[str, ArmReach]:

@@ -9,10 +9,12 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 
 from msdm_core.mesh import FloatArray
+from surgsim_apps.arms.arms_in_patient import ArmsInPatient
 from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
-from surgsim_apps.arms.pictures import ArmMaps, draw_arms, write_picture
+from surgsim_apps.arms.pictures import ArmMaps, camera_view, write_picture
 from surgsim_apps.arms.points_file import write_points
+from surgsim_apps.arms.port_moves import PortSearch
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.quantities import QUANTITIES
 from surgsim_apps.arms.ranking import rank
@@ -51,6 +53,7 @@ def evaluate_arms(
     seed: int = 0,
     count: int = 500,
     progress: StepProgress | None = None,
+    moves: bool = False,
     picture: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
@@ -65,7 +68,9 @@ def evaluate_arms(
         seed: draws the first point of the surface.
         count: number of points of the surface.
         progress: shows the steps.
-        picture: True to draw the arms in the patient; without OpenGL there is none, `progress` says why.
+        moves: True to try moves of the ports.
+        picture: True for a scene and a picture of the arms in the patient; without OpenGL there is no picture,
+            `progress` says why.
 
     Raises:
         ValueError: a wrong scene, arm or port, in one line with the way out.
@@ -112,9 +117,17 @@ def evaluate_arms(
         ports=where.frames,
         cycle=cycle,
     )
+    if moves and not both.reachable[~sites.inner].all():
+        with progress.step("moving the ports"):
+            search = PortSearch(dict(zip(SIDES, (left, right))), anatomy, organ, sites)
+            found = dict(zip(SIDES, reaches))
+            move = search.best_move(where, found, both.reachable, camera_view(evaluation))
+        evaluation = replace(evaluation, move=move, moves_tried=True)
     if picture:
+        shown = ArmsInPatient.at_middle(evaluation, arms, both, where)
+        evaluation = replace(evaluation, turning=shown.scene())
         try:
-            evaluation = replace(evaluation, picture=draw_arms(evaluation, arms, where))
+            evaluation = replace(evaluation, picture=shown.picture())
         except NoGLError as error:
             progress.say(f"no picture: {error}")
     return evaluation
@@ -234,6 +247,7 @@ def run_study(
                     seed=seed,
                     count=points,
                     progress=progress,
+                    moves=setup is setups[0],
                     picture=setup is setups[0],
                 )
             )

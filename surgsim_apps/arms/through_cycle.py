@@ -149,7 +149,7 @@ def _followed(
     if rows.size:
         for number, (sites, obstacles) in enumerate(zip(places, around, strict=True)):
             chain = kinematics.at(paths[number, rows])
-            organ = obstacles.organ_clearance(kinematics, chain, exact=True)
+            organ = obstacles.organ_clearance(kinematics, chain)
             organ = np.where(sites.inner[rows], np.inf, organ)
             clearance[number, rows] = np.minimum(organ, obstacles.wall_clearance(kinematics, chain))
     return ArmThroughCycle(reachable, paths, clearance)
@@ -181,7 +181,7 @@ def _next(
     """Joints (n, n_joint) that follow some points (rows) to a position, and a mask of those within all rules (n,)."""
     candidates = search_joints(kinematics, Wanted(sites.tips(around.ball)[rows]), joints)
     chain = kinematics.at(candidates.joints)
-    clear = sites.inner[rows] | (around.organ_clearance(kinematics, chain, exact=False) >= 0.0)
+    clear = sites.inner[rows] | around.clears_organ(kinematics, chain)
     return candidates.joints, candidates.met & clear & (around.wall_clearance(kinematics, chain) >= 0.0)
 
 

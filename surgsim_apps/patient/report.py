@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msdm_core.arithmetic import matmul
+from msdm_core.arithmetic import dot, matmul
 from msdm_core.material import Lesion, lesion_extent
-from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality
+from msdm_core.mesh import FloatArray, IntArray, TetMesh, mesh_quality, outer_faces, surface_carriers
 from msdm_core.organ import compile_organ, stable_dt
 from surgsim_apps.palpate.hold import Hold
+from surgsim_apps.palpate.sites import plan_sites
 from surgsim_apps.patient.meshers import DIHEDRAL_SMALLEST
 from surgsim_apps.patient.patient_scene import PatientScene
 from surgsim_apps.patient.retract_scene import RetractScene, retraction_text
 from surgsim_apps.patient.supports import held_text
 from surgsim_apps.reports.html_page import Picture, render_page
 from surgsim_apps.reports.surface_drawing import INK, PAPER, OrthographicView, Patches, draw_patches, organ_patches
+from surgsim_apps.reports.turning_scene import SolidPart, TurningScene, marks_part, turning_scene
 from surgsim_env.rendering import cut_edges
 from surgsim_env.scene import Scene, hidden_share, share_text
 
@@ -35,6 +37,8 @@ HELD = np.array([0.42, 0.47, 0.56])
 SECTION = np.array([0.90, 0.70, 0.62])
 # Colours of the regions after the first, repeated cyclically.
 REGIONS = np.array([[0.95, 0.78, 0.18], [0.25, 0.55, 0.85], [0.35, 0.70, 0.45], [0.62, 0.42, 0.75], [0.92, 0.50, 0.20]])
+# Opacity of an organ over its regions, and radius of a site's mark over the sites' spacing.
+OPACITY, SITE_SHARE = 0.55, 0.1
 # Views: direction, upward direction, and titles for the axes of a scan and for other axes.
 SIDES = (
     ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), "from the front", "along y"),
@@ -63,7 +67,8 @@ def report_page(
         "organ.html.j2",
         generator="surgsim organ",
         title=f"Organ: {organ.scene.description}",
-        verdict=verdict(organ),
+        verdict=verdict(organ, retraction),
+        scene=organ_scene(organ),
         notes=organ.notes,
         source=_source(organ),
         volumes=_volumes(organ),
@@ -79,23 +84,34 @@ def report_page(
     )
 
 
-def verdict(organ: PatientScene) -> str:
-    """Main results in a sentence or two."""
-    patient, quality = organ.patient, mesh_quality(organ.patient.mesh)
-    fits = abs(patient.volume_error) <= VOLUME_ERROR_LARGEST
-    shaped = quality.dihedral_smallest_deg >= DIHEDRAL_SMALLEST
-    text = (
-        f"The mesh has {quality.tet_count} tets and {quality.volume * 1e6:.1f} ml, "
-        f"{patient.volume_error:+.2%} against the file"
-        f"{'' if fits else ' (more than 2 %: use smaller cells)'}; the smallest dihedral angle is "
-        f"{quality.dihedral_smallest_deg:.1f} degrees{'' if shaped else ' (below 10: it makes the step short)'}."
-    )
-    count = len(patient.lesions)
-    text += (
-        f" {count} segmented lesion{'s are' if count != 1 else ' is'} in it." if count else " No lesion was segmented."
-    )
-    remarks = len(organ.notes)
-    return text + (f" {remarks} remark{'s' if remarks != 1 else ''} below." if remarks else "")
+def verdict(organ: PatientScene, retraction: RetractScene | str | None = None) -> str:
+    """What can be done with the organ, what limits it, and what it is made of, in a few sentences."""
+    patient, quality, lesion = organ.patient, mesh_quality(organ.patient.mesh), organ.scene.lesion
+    use, limits = [f"can be pressed at {organ.site_count} sites"], []
+    if lesion is None:
+        limits.append("it has no room for hidden lesions")
+    else:
+        low, high = (f"{radius * 1e3:.3g}" for radius in lesion.radius)
+        use.append(f"has room for hidden lesions of {low} to {high} mm radius")
+    if isinstance(retraction, RetractScene):
+        use.append("has an edge to lift")
+    elif retraction is not None:
+        limits.append(f"it cannot be lifted ({retraction})")
+    if organ.hold is not None:
+        limits += [fault.partition(";")[0] for fault in organ.hold.faults]
+    if abs(patient.volume_error) > VOLUME_ERROR_LARGEST:
+        limits.append("its volume is more than 2 % off (use smaller cells)")
+    if quality.dihedral_smallest_deg < DIHEDRAL_SMALLEST:
+        limits.append(f"a dihedral angle of {quality.dihedral_smallest_deg:.1f} degrees makes the step short")
+    count, remarks = len(patient.lesions), len(organ.notes)
+    sentences = [
+        f"This organ {', '.join(use[:-1])}{' and ' if use[1:] else ''}{use[-1]}.",
+        f"What limits: {'; '.join(limits)}." if limits else "Nothing limits it.",
+        f"The mesh has {quality.volume * 1e6:.1f} ml, {patient.volume_error:+.2%} against the file, and "
+        f"{count or 'no'} segmented lesion{'' if count == 1 else 's'}.",
+        f"{remarks} remark{'' if remarks == 1 else 's'} below." if remarks else "",
+    ]
+    return " ".join(filter(None, sentences))
 
 
 def _source(organ: PatientScene) -> Rows:
@@ -176,6 +192,39 @@ def _hidden_text(hold: Hold, scene: Scene) -> str:
     return (
         f"contact of {contact:.3g} N/m^3 hides about {share:.1%} of the contrast over 1 where a press feels "
         f"{force:.2f} N, twice as much as a healthy one"
+    )
+
+
+def organ_scene(organ: PatientScene) -> TurningScene:
+    """The organ as the probe sees it, translucent over its regions, with the sites of its presses."""
+    from matplotlib.colors import to_hex
+
+    mesh = organ.anatomy.mesh
+    surface, triangles = organ.anatomy.outer_surface
+    rows, index = np.unique(triangles, return_inverse=True)
+    points = surface[rows]
+    tints = [(name, _region_colours(mesh)[tag], tag) for tag, name in mesh.region_names[1:]]
+    # A point has the colour of the boundary triangle below it.
+    colours = _outer_colours(organ)[surface_carriers(points, mesh).triangle]
+    parts = [
+        SolidPart(name, mesh.points, outer_faces(mesh.tets[mesh.region == tag])[0], to_hex(colour.tolist()))
+        for name, colour, tag in tints
+    ]
+    sites, _, _ = plan_sites(organ.anatomy)
+    parts.append(marks_part("sites", sites, SITE_SHARE * organ.scene.palpation.site_spacing, INK))
+    opacity = OPACITY if tints else 1.0
+    parts.append(SolidPart("organ", points, index.reshape(-1, 3).astype(np.int32), colours, opacity))
+    named = [
+        ("palpable face", PALPABLE),
+        ("held", HELD),
+        ("free", TISSUE),
+        *((name, colour) for name, colour, _ in tints),
+    ]
+    legend = [*((name, to_hex(colour.tolist())) for name, colour in named), (f"{len(sites)} sites to press", INK)]
+    approach, up = np.array(organ.scene.instrument.approach), np.array(organ.scene.cranial)
+    upright = up if abs(dot(approach, up)) < 0.9 else None
+    return turning_scene(
+        parts, OrthographicView.along(approach, upright), "The organ as the probe approaches it.", legend
     )
 
 

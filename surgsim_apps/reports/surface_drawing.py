@@ -136,13 +136,14 @@ def shaded(colours: FloatArray, normals: FloatArray, view: OrthographicView, glo
     return np.clip(colours * (AMBIENT + DIFFUSE * diffuse) + gloss * highlight, 0.0, 1.0)
 
 
-def tube(start: FloatArray, end: FloatArray, radius: float) -> tuple[FloatArray, IntArray]:
+def tube(
+    start: FloatArray, end: FloatArray, radius: float, rings: int = 17, count: int = 28
+) -> tuple[FloatArray, IntArray]:
     """Points and outward triangles of a capsule between two points, or of a ball at a single point."""
     along = end - start
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
     first, second = tangent_axes(axis)
-    rings, count = 17, 28
     latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)
     angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     around = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second

@@ -86,7 +86,7 @@ def test_the_verdict_says_what_the_arrays_say(evaluation):
     left, right, outer = evaluation.left, evaluation.right, ~evaluation.inner
     shares = [f"{100 * mask[outer].mean():.0f} %" for mask in (left.reachable, right.reachable, evaluation.both)]
     assert f"the left arm reaches {shares[0]}, the right arm {shares[1]}, and both at once {shares[2]}." in sentence
-    assert "Of 110 points on the surface of ellipsoid that face the ports" in sentence
+    assert "of 110 points on the surface of ellipsoid that face the ports" in sentence
     assert f"Of 10 targets inside it both at once reach {evaluation.both[evaluation.inner].sum()}." in sentence
 
 

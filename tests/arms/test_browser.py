@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from matplotlib.image import imread
 from surgsim_apps.arms.pictures import ArmMaps, write_picture
 from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.report import write_report
-from surgsim_apps.reports.html_page import POLICY
+from surgsim_apps.reports.html_page import POLICY, SCENE_POLICY
+from surgsim_apps.reports.surface_drawing import OrthographicView
+from surgsim_apps.reports.turning_scene import SolidPart, turning_scene
 from tests.arms.made import made_evaluation
 from tests.chromium import Browser
 
@@ -41,6 +44,9 @@ def shown(chromium):
 def report(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     evaluation = made_evaluation()
+    part = SolidPart("organ", evaluation.surface_points, evaluation.surface_triangles, "#0000ff")
+    view = OrthographicView.along(np.array([0.0, 1.0, 0.0]))
+    evaluation = replace(evaluation, turning=turning_scene([part], view, "An organ.", [("organ", "#0000ff")]))
     others = [("ports.toml", "as given", evaluation), ("wide.toml", "ports", made_evaluation(seed=1))]
     path = folder / "report.html"
     write_report(
@@ -77,7 +83,7 @@ def test_a_page_with_a_fault_is_noticed(report, tmp_path, shown):
 @pytest.mark.parametrize("width", [1280, 500])
 def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, shown, width):
     text = report.read_text(encoding="utf-8")
-    assert f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">' in text
+    assert f'<meta http-equiv="Content-Security-Policy" content="{POLICY}{SCENE_POLICY}">' in text
     browser = shown(report, width)
     made = browser.run(MADE)
     assert browser.complaints() == []
@@ -85,6 +91,24 @@ def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, s
     assert min(made["images"]) >= 60
     assert made["widest"] <= made["window"] == width
     assert made["loaded"] == 0
+
+
+def test_the_scene_turns(report, shown):
+    """It is drawn, by the page's one script, and again from another side after a drag."""
+    browser = shown(report, 1280, 1600)
+    box = browser.run(
+        "(() => { const r = document.querySelector('iframe').getBoundingClientRect();"
+        " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+    )
+
+    def blue():
+        image = imread(io.BytesIO(browser.shot()))
+        return image[:, :, 2] > image[:, :, 0] + 0.3
+
+    browser.wait_until(lambda: blue().sum() > 20_000)
+    before = blue()
+    browser.drag(tuple(box), (box[0] + 120.0, box[1] + 60.0), lambda: (blue() != before).sum() > 2000)
+    assert browser.complaints() == []
 
 
 def test_it_prints(report, shown):

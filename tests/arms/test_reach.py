@@ -144,6 +144,9 @@ def test_tip_may_touch_what_it_touches(tmp_path):
         site = surface_sites([[0.0, 0.0, -0.15]])
         report = evaluate_reach(kinematics, site, around(organ=plate_at(-0.15 + height))).report
         assert bool(report.reachable[0]) == reached
+        # Contact on purpose is no lack of clearance: the shaft 20 mm above the tip is that far from the organ.
+        if reached:
+            assert report.organ_clearance[0] == pytest.approx(0.02 - height - RADIUS, abs=1e-6)
 
 
 def test_inner_target_lies_behind_the_organ(tmp_path):

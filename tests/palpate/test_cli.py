@@ -132,7 +132,7 @@ def test_the_report_has_the_lesion_with_its_error_and_loads_nothing(run, summary
     for place in (entry["estimates"][lesion["estimate"]]["point_m"], truth["surface_point_m"]):
         assert ", ".join(f"{1e3 * value:.1f}" for value in place) in text
     assert f">{lesion['error_mm']:.1f}<" in text and f">{lesion['contrast']:.2f}<" in text
-    assert text.count('<img src="data:image/png;base64,') == text.count("<img") == 2
+    assert text.count('<img src="data:image/webp;base64,') == text.count("<img") == 2
     assert "surgsim palpate --scene phantom --spacing 0.008 --seed 7" in text and str(run) not in text
 
 

@@ -115,7 +115,7 @@ def check_files(out: Path, summary: dict) -> None:
 def check_report(folder: Path, name: str) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert page.rstrip().endswith("</html>")
-    assert "data:image/png;base64," in page
+    assert "data:image/webp;base64," in page
     assert all(held_text(anchor) in html.unescape(page) for anchor in load_scene(folder / f"{name}.toml").anchors)
 
 

@@ -9,6 +9,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
+from surgsim_env.rendering.gl import NoGLError
 from surgsim_env.rendering.vessels import tissue_field
 
 TISSUE_LENGTH = 10.0
@@ -128,7 +129,11 @@ class EndoscopicShading:
     """Shading programs and field of tissue in the current graphics context, for pictures of one size."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Compile the programs for a size [pixels] and load the field."""
+        """Compile the programs for a size [pixels] and load the field.
+
+        Raises:
+            NoGLError: this OpenGL cannot.
+        """
         from OpenGL import GL
 
         self._gl, self._size = GL, (width, height)
@@ -145,9 +150,8 @@ class EndoscopicShading:
     def used(self, name: str, distance: float) -> Iterator[None]:
         """Shade what is drawn within the block by a program, seen by a camera aimed at a distance [m]."""
         gl, program = self._gl, self._programs[name]
-        with self._unit():
-            pass
-        gl.glUseProgram(program)
+        with self._unit():  # bound anew: another stage of the context may have bound its own
+            gl.glUseProgram(program)
         gl.glUniform1i(gl.glGetUniformLocation(program, b"field"), UNIT)
         gl.glUniform3f(gl.glGetUniformLocation(program, b"view"), distance, *(1.0 / side for side in self._size))
         try:
@@ -179,11 +183,11 @@ class EndoscopicShading:
             shader = gl.glCreateShader(kind)
             gl.glShaderSource(shader, source)
             gl.glCompileShader(shader)
-            if not gl.glGetShaderiv(shader, gl.GL_COMPILE_STATUS):
-                print(gl.glGetShaderInfoLog(shader).decode())
             gl.glAttachShader(program, shader)
             gl.glDeleteShader(shader)
         gl.glLinkProgram(program)
+        if not gl.glGetProgramiv(program, gl.GL_LINK_STATUS):
+            raise NoGLError('OpenGL has no shading language 1.20 for style="endoscopic": use style="plain"')
         return program
 
 

@@ -33,8 +33,8 @@ class RenderOptions:
         cut_away: the organ is cut open through its first lesion (without one, through its palpable face).
         smooth_edges: four samples for each pixel; without it pictures take half the time.
         paint: field painted on the organ, a name of `painted_fields.PAINTED_FIELDS`; None for none.
-        style: "endoscopic" (wet tissue in an abdomen, under the light of an endoscope) or "plain" (a drape with squares);
-            pictures with a look or with paint are plain.
+        style: "endoscopic" (wet tissue in an abdomen, lit by an endoscope) or "plain" (a drape with squares); pictures
+            with a look or with paint are plain.
 
     Raises:
         ValueError: names the option, its value and the rule.

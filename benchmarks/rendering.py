@@ -41,7 +41,8 @@ def main() -> None:
     parser.add_argument("--style", default="endoscopic")
     arguments = parser.parse_args()
     for number, (name, options) in enumerate(CASES.items()):
-        env = gym.make("SurgSim/Palpate-v0", scene=arguments.scene, render_mode="rgb_array", style=arguments.style, **options)
+        options |= {"scene": arguments.scene, "style": arguments.style}
+        env = gym.make("SurgSim/Palpate-v0", render_mode="rgb_array", **options)
         env.reset(seed=5)
         press(env, 8)
         draw = {name: env.render}

@@ -1,4 +1,4 @@
-"""Make the pictures of environments, the gallery and tutorials: docs/make_environment_pictures.py [NAME ...] (minutes)."""
+"""Make the clips and pictures of environments and tutorials: docs/make_environment_pictures.py [NAME ...] (minutes)."""
 
 import contextlib
 import re

@@ -140,18 +140,21 @@ class EndoscopicShading:
         self._programs: dict[str, Any] = {name: self._compile(source) for name, source in PROGRAMS.items()}
         values = tissue_field()
         self._field = GL.glGenTextures(1)
-        with self._unit():
-            for name in (GL.GL_TEXTURE_MIN_FILTER, GL.GL_TEXTURE_MAG_FILTER):
-                GL.glTexParameteri(GL.GL_TEXTURE_3D, name, GL.GL_LINEAR)
-            kind = GL.GL_RGBA, GL.GL_UNSIGNED_BYTE
-            GL.glTexImage3D(GL.GL_TEXTURE_3D, 0, GL.GL_RGBA8, *values.shape[:3], 0, *kind, values)
+        GL.glBindTexture(GL.GL_TEXTURE_3D, self._field)
+        for name in (GL.GL_TEXTURE_MIN_FILTER, GL.GL_TEXTURE_MAG_FILTER):
+            GL.glTexParameteri(GL.GL_TEXTURE_3D, name, GL.GL_LINEAR)
+        kind = GL.GL_RGBA, GL.GL_UNSIGNED_BYTE
+        GL.glTexImage3D(GL.GL_TEXTURE_3D, 0, GL.GL_RGBA8, *values.shape[:3], 0, *kind, values)
 
     @contextlib.contextmanager
     def used(self, name: str, distance: float) -> Iterator[None]:
         """Shade what is drawn within the block by a program, seen by a camera aimed at a distance [m]."""
         gl, program = self._gl, self._programs[name]
-        with self._unit():  # bound anew: another stage of the context may have bound its own
-            gl.glUseProgram(program)
+        # Other stages of the context have fields of their own.
+        gl.glActiveTexture(gl.GL_TEXTURE0 + UNIT)
+        gl.glBindTexture(gl.GL_TEXTURE_3D, self._field)
+        gl.glActiveTexture(gl.GL_TEXTURE0)
+        gl.glUseProgram(program)
         gl.glUniform1i(gl.glGetUniformLocation(program, b"field"), UNIT)
         gl.glUniform3f(gl.glGetUniformLocation(program, b"view"), distance, *(1.0 / side for side in self._size))
         try:
@@ -164,17 +167,6 @@ class EndoscopicShading:
         for program in self._programs.values():
             self._gl.glDeleteProgram(program)
         self._gl.glDeleteTextures([self._field])
-
-    @contextlib.contextmanager
-    def _unit(self) -> Iterator[None]:
-        """Bind the field to its texture unit, which is active within the block."""
-        gl = self._gl
-        gl.glActiveTexture(gl.GL_TEXTURE0 + UNIT)
-        gl.glBindTexture(gl.GL_TEXTURE_3D, self._field)
-        try:
-            yield
-        finally:
-            gl.glActiveTexture(gl.GL_TEXTURE0)
 
     def _compile(self, fragment: str) -> Any:
         gl = self._gl

@@ -68,6 +68,8 @@ DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
 # Tissue on which fields are painted, and the colour that multiplies theirs: the lights add up to more than 1.
 PAINTED, PAINTED_COLOUR = ("organ", "held", "section", "section_lesion"), (0.78, 0.78, 0.78)
+# Supports in endoscopic pictures, like the wall of the abdomen.
+SUPPORT_COLOUR = (0.66, 0.36, 0.31)
 # Groups of geoms in endoscopic pictures: seen in colour alone, and in depth and labels alone.
 SCENERY_GROUP, DRAPE_GROUP = 4, 5
 # Name of the texture of vessels or a field, white until a look draws them.
@@ -187,6 +189,10 @@ def build_scene(
     geoms = find_instrument(model, instrument)
     if options.paint is not None:
         _paint(model, geoms)
+    if options.style == "endoscopic":
+        for geom in geoms.target:
+            if model.geom(geom).name.startswith(SUPPORT_PREFIX):
+                model.geom_rgba[geom, :3] = SUPPORT_COLOUR
     return SceneModel(model, data, drawn, geoms, light, ground, anatomy.downward)
 
 

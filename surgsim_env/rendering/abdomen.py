@@ -1,7 +1,7 @@
 """Abdomen around an organ in endoscopic pictures: a floor of fat, loops of bowel behind the organ, and a wall."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering.cameras import scene_cameras
@@ -66,7 +66,7 @@ def abdomen(anatomy: Anatomy, ground: FloatArray) -> Shape:
     near = np.stack([first, first + SECTORS, second + SECTORS], axis=-1).reshape(-1, 3)
     far = np.stack([first, second + SECTORS, second], axis=-1).reshape(-1, 3)
     faces = np.concatenate([near, far]).astype(np.int32)
-    gap, _ = cKDTree(points[anatomy.mesh.boundary_nodes]).query(vertices)
+    gap, _ = KDTree(points[anatomy.mesh.boundary_nodes]).query(vertices)
     light = 1.0 - np.exp(-gap / (SHADE_WIDTH * radius))
     is_bowel = np.clip(12.0 * bowel, 0.0, 1.0)
     fat = (1.0 - is_bowel) * np.clip(FAT_END - ring, 0.0, 1.0) * is_floor

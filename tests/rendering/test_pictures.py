@@ -226,7 +226,8 @@ def test_the_abdomen_hides_nothing(press, draw, camera):
     labels, scene = renderer.segmentation(), renderer._stage.scene
     with renderer._shown(renderer.cameras[camera]) as shown:
         shown.canvas.look(renderer.cameras[camera], groups=[*FRONT_GROUPS, SCENERY_GROUP])
-        numbers, geoms = shown.canvas.numbers(), shown.canvas.drawn.geoms
+        numbers, drawn = shown.canvas.numbers(), shown.canvas.drawn
+        geoms = drawn.geoms[: drawn.ngeom]
     (abdomen,) = [geom.segid + 1 for geom in geoms if geom.segid >= 0 and geom.objid == scene.model.geom(ABDOMEN).id]
     np.testing.assert_array_equal(numbers == abdomen, labels == LABELS["background"])
 

@@ -38,9 +38,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", default="liver")
     parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--style", default="endoscopic")
     arguments = parser.parse_args()
     for number, (name, options) in enumerate(CASES.items()):
-        env = gym.make("SurgSim/Palpate-v0", scene=arguments.scene, render_mode="rgb_array", **options)
+        options |= {"scene": arguments.scene, "style": arguments.style}
+        env = gym.make("SurgSim/Palpate-v0", render_mode="rgb_array", **options)
         env.reset(seed=5)
         press(env, 8)
         draw = {name: env.render}

@@ -1,4 +1,4 @@
-"""Make the pictures of environments and tutorials: python docs/make_environment_pictures.py [NAME ...] (minutes)."""
+"""Make the clips and pictures of environments and tutorials: docs/make_environment_pictures.py [NAME ...] (minutes)."""
 
 import contextlib
 import re
@@ -23,7 +23,19 @@ SIZE = (480, 360)
 STEP_MS = 50
 PRESSES, PRESS_SHOWN_MS = 16, 600
 TUTORIALS = ("organ", "robot")
-BOTH = ("overview", "endoscope")
+# Clips of the gallery: size, and steps down and up of a press at a share of the largest speed.
+CLIP_SIZE, CLIP_STEPS, CLIP_SPEED = (320, 240), (16, 8), 0.6
+ORGANS = (
+    *("phantom", "phantom_small", "phantom_wide", "agarose_prism", "bovine_liver_block"),
+    *("liver", "liver_family", "kidney_family", "spleen_family"),
+)
+# Instruments with the organs that they touch.
+INSTRUMENTS = {
+    "psm_palpator": "liver",
+    "six_axis": "liver",
+    "psm_grasper": "kidney_family",
+    "psm_retractor": "spleen_family",
+}
 
 
 class Filmed(gym.Wrapper):
@@ -98,6 +110,29 @@ def film_slide(path: Path, *, seed: int) -> None:
     write(env.frames, path, 100)
 
 
+def film_press(path: Path, scene: str, instrument: str | None = None) -> None:
+    """A press above the hidden lesion of an organ, and away."""
+    size = {"width": CLIP_SIZE[0], "height": CLIP_SIZE[1]}
+    env = gym.make("SurgSim/Palpate-v0", scene=scene, instrument=instrument, render_mode="rgb_array", **size)
+    env.reset(seed=4)
+    inner = env.unwrapped
+    assert isinstance(inner, SurgicalEnv)
+    anatomy = inner.simulation.anatomy
+    point, outward = anatomy.face.project(inner.task.lesion.centre)
+    inner.simulation.restart(point + outward * (anatomy.scene.instrument.tip_radius + 0.004))
+    frames = []
+    for part, steps in zip((-CLIP_SPEED, CLIP_SPEED), CLIP_STEPS, strict=True):
+        for _ in range(steps):
+            action = np.zeros(env.action_space.shape or (), dtype=np.float32)
+            action[:3] = part * outward
+            over = any(env.step(action)[2:4])
+            frames.append(Image.fromarray(inner.renderer.rgb("overview")))
+            if over:
+                break
+    write(frames, path, 2 * STEP_MS)
+    env.close()
+
+
 def draw_tutorial(name: str, path: Path) -> None:
     """The picture of a tutorial on one's own organ or robot, by its code."""
     text = (Path(__file__).parent / "tutorials" / f"own_{name}.md").read_text(encoding="utf-8")
@@ -122,9 +157,13 @@ def main(names: list[str]) -> None:
         ),
     }
     with output_folder(IMAGES) as images:
-        for name in names or [*films, *TUTORIALS]:
+        for name in names or [*films, *ORGANS, *INSTRUMENTS, *TUTORIALS]:
             if name in TUTORIALS:
                 draw_tutorial(name, images / f"tutorial_{name}.png")
+            elif name in ORGANS:
+                film_press(images / f"organ_{name}.webp", name)
+            elif name in INSTRUMENTS:
+                film_press(images / f"instrument_{name}.webp", INSTRUMENTS[name], name)
             else:
                 films[name](images / f"env_{name}.webp")
 

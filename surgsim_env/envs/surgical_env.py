@@ -111,7 +111,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
         self._named: dict[str, slice] | None = None
         if obs_mode.startswith("rgb"):
             sight = {"camera": "endoscope", "width": PICTURE_SIZE, "height": PICTURE_SIZE}
-            sight |= {"show_force": False, "smooth_edges": False}
+            # Policies keep the style of their training.
+            sight |= {"show_force": False, "smooth_edges": False, "style": "plain"}
             self._eye = EpisodeView(self.simulation, "rgb_array", sight)
             self.observation_space = gym.spaces.Box(0, 255, (PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
         low, high = self.as_observed(self._low), self.as_observed(self._high)

@@ -9,6 +9,8 @@ from surgsim_env.scene.load import nearest, require_known
 
 # Cameras of each scene.
 CAMERAS = ("overview", "endoscope", "side", "above")
+# Styles of pictures.
+STYLES = ("endoscopic", "plain")
 # Largest side of a picture [pixels] that any OpenGL driver can draw.
 PIXELS_MOST = 4096
 
@@ -31,6 +33,8 @@ class RenderOptions:
         cut_away: the organ is cut open through its first lesion (without one, through its palpable face).
         smooth_edges: four samples for each pixel; without it pictures take half the time.
         paint: field painted on the organ, a name of `painted_fields.PAINTED_FIELDS`; None for none.
+        style: "endoscopic" (wet tissue in an abdomen, lit by an endoscope) or "plain" (a drape with squares); pictures
+            with a look or with paint are plain.
 
     Raises:
         ValueError: names the option, its value and the rule.
@@ -44,9 +48,11 @@ class RenderOptions:
     cut_away: bool = False
     smooth_edges: bool = True
     paint: str | None = None
+    style: str = "endoscopic"
 
     def __post_init__(self) -> None:
         check_camera(self.camera)
+        require_known("style", self.style, STYLES)
         if self.paint is not None:
             require_known("paint", self.paint, PAINTED_FIELDS)
         for name in ("width", "height"):

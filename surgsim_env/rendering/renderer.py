@@ -107,8 +107,8 @@ class OrganRenderer:
             NoGLError: there is no OpenGL; names the missing packages.
         """
         view = self._camera(camera)
-        with self._shown(view) as stage:
-            frame = stage.canvas.colour()
+        with self._shown(view, in_colour=True) as stage:
+            frame = stage.colour()
         if self.look is not None:
             frame = self.look.exposed(frame, self.moment)
         if self.options.paint is not None:
@@ -151,12 +151,12 @@ class OrganRenderer:
             canvas.present(frame)
 
     @contextlib.contextmanager
-    def _shown(self, camera: Camera) -> Iterator[Stage]:
+    def _shown(self, camera: Camera, *, in_colour: bool = False) -> Iterator[Stage]:
         """Stage with the simulation's current state before a camera; its graphics context is current."""
         with LOCK:
             stage = self._ready_stage()
             stage.canvas.gl_context.make_current()
-            self._show(stage, camera)
+            self._show(stage, camera, in_colour)
             yield stage
 
     def _camera(self, camera: str | Camera | None) -> Camera:
@@ -170,14 +170,19 @@ class OrganRenderer:
 
     def _ready_stage(self) -> Stage:
         self.follow_anatomy()
+        # Looks and the colours of a field are those of the plain style.
+        style = "plain" if self.look is not None or self.options.paint is not None else self.options.style
+        if self._stage is not None and self._stage.style != style:
+            self.close()
         if self._stage is None:
             context = gl.context() if self._gl_context is None else self._gl_context
             simulation = self._simulation
-            self._stage = borrow_stage(simulation.anatomy, simulation.instrument.model, self.options, context)
+            options = replace(self.options, style=style)
+            self._stage = borrow_stage(simulation.anatomy, simulation.instrument.model, options, context)
             self._finalizer = weakref.finalize(self, give_back_stage, self._stage)
         return self._stage
 
-    def _show(self, stage: Stage, camera: Camera) -> None:
+    def _show(self, stage: Stage, camera: Camera, in_colour: bool) -> None:
         simulation, options = self._simulation, self.options
         shown = self.lesions if options.show_lesion or options.cut_away else ()
         if self._tissue is None or shown != self._tissue_lesions:
@@ -193,7 +198,8 @@ class OrganRenderer:
             light = scene.light if self.look is None else self.look.lit(scene.light, -up)
             shapes["shadow"] = ground_shadow(nodes, triangles, light, scene.ground, up)
         lesions = tissue.lesion_ellipsoids(nodes) if options.show_lesion else []
-        stage.show(camera, shapes, simulation.instrument.data, lesions, self.target, self.look)
+        data = simulation.instrument.data
+        stage.show(camera, shapes, data, lesions, self.target, self.look, in_colour=in_colour)
 
     def _paint(self, shapes: dict[str, Shape], field: PaintedField, tissue: Tissue) -> None:
         """Give the shapes of tissue their places on a field's scale, whose end is NaN for a diverged organ."""

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, SUPPORT_PREFIX
+from surgsim_env.rendering import abdomen
 from surgsim_env.rendering.cameras import cut_direction
 from surgsim_env.rendering.embedding import EmbeddedSurface
+from surgsim_env.rendering.endoscopic import TISSUE_LENGTH
 from surgsim_env.rendering.options import RenderOptions
 from surgsim_env.rendering.painted_fields import field_colours
 from surgsim_env.rendering.surface import DrawnSurface, Shape
@@ -21,6 +23,8 @@ from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.scene.palpable_surface import tangent_axes
 
 Colour = tuple[float, float, float]
+# Name of the mesh of an abdomen.
+ABDOMEN = "abdomen"
 
 
 # Prefix of the names of an instrument's geoms.
@@ -51,6 +55,7 @@ FINISHES = {
     "section": Finish((0.590, 0.235, 0.195), 0.10, 0.20, 0.25),
     "section_lesion": Finish((0.980, 0.860, 0.500), 0.10, 0.20, 0.25),
     "shadow": Finish((0.055, 0.150, 0.170), 0.0, 0.0),
+    ABDOMEN: Finish((0.7, 0.5, 0.3), 0.0, 0.0),
 }
 LESION_COLOUR = (0.98, 0.84, 0.42)
 TARGET_COLOUR = (0.20, 0.75, 0.35)
@@ -63,6 +68,10 @@ DRAPE_WIDTH, DRAPE_GAP = 10.0, 0.0005
 TRANSLUCENT = 0.34
 # Tissue on which fields are painted, and the colour that multiplies theirs: the lights add up to more than 1.
 PAINTED, PAINTED_COLOUR = ("organ", "held", "section", "section_lesion"), (0.78, 0.78, 0.78)
+# Supports in endoscopic pictures, like the wall of the abdomen.
+SUPPORT_COLOUR = (0.66, 0.36, 0.31)
+# Groups of geoms in endoscopic pictures: seen in colour alone, and in depth and labels alone.
+SCENERY_GROUP, DRAPE_GROUP = 4, 5
 # Name of the texture of vessels or a field, white until a look draws them.
 VESSELS = "vessels"
 # Clipping planes of the cameras [m].
@@ -75,8 +84,9 @@ _TETRAHEDRON_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtyp
 class DrawnMesh:
     """Mesh of a compiled model with a new shape for each picture."""
 
-    def __init__(self, model: mujoco.MjModel, name: str) -> None:
-        self._model = model
+    def __init__(self, model: mujoco.MjModel, name: str, *, is_solid: bool = False) -> None:
+        # The endoscopic style wants the resting places of solid tissue.
+        self._model, self._is_solid = model, is_solid
         self.mesh = model.mesh(name).id
         self.geom = model.geom(name).id
         self._face_count = int(model.mesh_facenum[self.mesh])
@@ -84,9 +94,14 @@ class DrawnMesh:
     def upload(self, shape: Shape, context: mujoco.MjrContext) -> None:
         """Replace the shape of the mesh, in the world's axes."""
         model, mesh, count = self._model, self.mesh, len(shape.vertices)
+        normals, face_places = shape.normals, shape.face_places
+        if self._is_solid and shape.rest is not None:
+            first_place = model.mesh_texcoordadr[mesh]
+            model.mesh_texcoord[first_place : first_place + count] = shape.rest[:, :2]
+            normals, face_places = normals * (TISSUE_LENGTH + shape.rest[:, 2:]), shape.faces
         for array, address, values in (
             (model.mesh_vert, model.mesh_vertadr, shape.vertices),
-            (model.mesh_normal, model.mesh_normaladr, shape.normals),
+            (model.mesh_normal, model.mesh_normaladr, normals),
         ):
             array[address[mesh] : address[mesh] + count] = values
         first = model.mesh_faceadr[mesh]
@@ -96,8 +111,8 @@ class DrawnMesh:
             # The second half of the texture leads back.
             first_place = model.mesh_texcoordadr[mesh]
             model.mesh_texcoord[first_place : first_place + count, 0] = 0.5 * shape.shares
-        if shape.face_places is not None:
-            model.mesh_facetexcoord[first : first + len(shape.faces)] = shape.face_places
+        if face_places is not None:
+            model.mesh_facetexcoord[first : first + len(shape.faces)] = face_places
         self._face_count = len(shape.faces)
         self.show(True, context)
 
@@ -156,22 +171,28 @@ def build_scene(
     ground = _add_drape(spec, anatomy)
     meshes = _room(anatomy, surface, options)
     places = None if options.cut_away else texture_places(surface.follow(anatomy.mesh.points)[0], surface.faces)[0]
-    if options.paint is not None:
-        # Room for a place of each vertex on the scale, in all shapes.
+    if options.paint is not None or options.style == "endoscopic":
+        # Room for a place of each vertex on the scale, or at rest, in all shapes.
         places = np.zeros((max(room[0] for room in meshes.values()), 2), dtype=np.float32)
     vessels = spec.add_texture(name=VESSELS, type=mujoco.mjtTexture.mjTEXTURE_2D, width=TEXTURE_SIZE)
     vessels.height, vessels.builtin = TEXTURE_SIZE, mujoco.mjtBuiltin.mjBUILTIN_FLAT
     vessels.rgb1 = vessels.rgb2 = [1.0, 1.0, 1.0]
     for name, (vertices, faces) in meshes.items():
         whole = name in ("organ", "held")
-        opacity = TRANSLUCENT if options.show_lesion and whole else 1.0
-        textured = whole or options.paint is not None
+        opacity = TRANSLUCENT if options.show_lesion and whole and options.style == "plain" else 1.0
+        textured = whole or name == ABDOMEN or options.paint is not None
         add_tissue(spec, name, vertices, faces, opacity, places if textured else None)
+    if ABDOMEN in meshes:
+        spec.geom(ABDOMEN).group = SCENERY_GROUP
     add_instrument(spec, instrument)
-    model, data, drawn = compile_scene(spec, meshes)
+    model, data, drawn = compile_scene(spec, meshes, is_solid=options.style == "endoscopic")
     geoms = find_instrument(model, instrument)
     if options.paint is not None:
         _paint(model, geoms)
+    if options.style == "endoscopic":
+        for geom in geoms.target:
+            if model.geom(geom).name.startswith(SUPPORT_PREFIX):
+                model.geom_rgba[geom, :3] = SUPPORT_COLOUR
     return SceneModel(model, data, drawn, geoms, light, ground, anatomy.downward)
 
 
@@ -237,14 +258,14 @@ def add_tissue(
 
 
 def compile_scene(
-    spec: mujoco.MjSpec, meshes: Iterable[str]
+    spec: mujoco.MjSpec, meshes: Iterable[str], *, is_solid: bool = False
 ) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, DrawnMesh]]:
     """Compile a scene: its model, its data, and its meshes by name, in the world's axes."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
-    drawn = {name: DrawnMesh(model, name) for name in meshes}
+    drawn = {name: DrawnMesh(model, name, is_solid=is_solid) for name in meshes}
     for mesh in drawn.values():
         data.geom_xpos[mesh.geom] = 0.0
         data.geom_xmat[mesh.geom] = np.eye(3).ravel()
@@ -262,9 +283,11 @@ def _room(
         # A tet is cut in a quadrangle at most; its triangles are split, and a lesion's outline may divide each of them.
         small = 2 * SECTION_SPLITS**2 * most_tets_cut(anatomy.mesh, cut_direction(anatomy))
         room |= {"section": (6 * small, 2 * small), "section_lesion": (6 * small, 2 * small)}
-    elif not (options.show_lesion or anatomy.scene.supports):
+    elif not (options.style == "endoscopic" or options.show_lesion or anatomy.scene.supports):
         # An organ on supports does not lie on the drape and casts no shadow on it.
         room["shadow"] = (anatomy.mesh.node_count, len(anatomy.mesh.boundary_triangles))
+    if options.style == "endoscopic":
+        room[ABDOMEN] = abdomen.VERTEX_COUNT, abdomen.FACE_COUNT
     return room
 
 
@@ -317,6 +340,7 @@ def _add_drape(spec: mujoco.MjSpec, anatomy: Anatomy) -> FloatArray:
         quat=quaternion,
         size=[DRAPE_WIDTH * radius, DRAPE_WIDTH * radius, 0.1],
         material="drape",
+        group=DRAPE_GROUP,
         contype=0,
         conaffinity=0,
     )

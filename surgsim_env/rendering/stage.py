@@ -14,12 +14,24 @@ from numpy.typing import NDArray
 
 from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.rendering import gl
+from surgsim_env.rendering.abdomen import abdomen
 from surgsim_env.rendering.cameras import Camera
 from surgsim_env.rendering.drawn_look import DrawnLook
 from surgsim_env.rendering.embedding import boundary_surface, organ_surface
+from surgsim_env.rendering.endoscopic import EndoscopicShading
 from surgsim_env.rendering.looks import Look
 from surgsim_env.rendering.options import RenderOptions
-from surgsim_env.rendering.scene_model import FAR, LESION_COLOUR, NEAR, PREFIX, build_scene
+from surgsim_env.rendering.scene_model import (
+    ABDOMEN,
+    DRAPE_GROUP,
+    FAR,
+    LESION_COLOUR,
+    NEAR,
+    PREFIX,
+    SCENERY_GROUP,
+    TRANSLUCENT,
+    build_scene,
+)
 from surgsim_env.rendering.surface import TRIANGLES_MOST, Shape
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
@@ -34,6 +46,10 @@ MESH_LABELS = dict.fromkeys(("organ", "held", "section"), LABELS["organ"]) | {"s
 LESIONS_MOST = 100
 # Pixels for each triangle of the organ, at least: halves the time of small pictures.
 PIXELS_OF_TRIANGLE = 4
+# Groups of geoms in plain pictures, and in endoscopic ones before the abdomen.
+PLAIN_GROUPS, FRONT_GROUPS = (0, 1, 2, 3, DRAPE_GROUP), (0, 1, 2, 3)
+# Largest number of cameras of which a stage keeps pictures of the abdomen; a place that no camera sees.
+SCENERIES_MOST, BEYOND = 8, 1e6
 # Thickness of a drawn target [m], all of it below the disc itself.
 TARGET_THICKNESS = 2e-4
 
@@ -69,7 +85,6 @@ class Canvas:
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         self._visible = mujoco.MjvOption()
-        self._visible.geomgroup[:] = 1
         size = model.vis.global_
         self._rect = mujoco.MjrRect(0, 0, size.offwidth, size.offheight)
 
@@ -77,8 +92,10 @@ class Canvas:
         """Draw off screen from now on; call before uploading meshes."""
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
 
-    def look(self, camera: Camera, *, sky: bool = True) -> None:
-        """Take the current geoms, seen by a camera; without the sky drawing is faster."""
+    def look(self, camera: Camera, *, sky: bool = True, groups: Sequence[int] = PLAIN_GROUPS) -> None:
+        """Take the current geoms of some groups, seen by a camera; without the sky drawing is faster."""
+        self._visible.geomgroup[:] = 0
+        self._visible.geomgroup[list(groups)] = 1
         data = self._data
         data.cam_xpos[0], data.cam_xmat[0] = camera.position, camera.rotation.ravel()
         self._model.cam_fovy[0] = camera.fov
@@ -92,6 +109,21 @@ class Canvas:
         mujoco.mjr_render(self._rect, self.drawn, self.context)
         mujoco.mjr_readPixels(frame, None, self._rect, self.context)
         return np.ascontiguousarray(frame[::-1])
+
+    def layer(self) -> NDArray[np.uint8]:
+        """Picture before nothing, with the covered share of each pixel (height, width, 4), its first row on top."""
+        from OpenGL import GL
+
+        context, size = self.context, (self._rect.width, self._rect.height)
+        mujoco.mjr_render(self._rect, self.drawn, context)
+        if context.offSamples:
+            GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, context.offFBO_r)
+            GL.glBlitFramebuffer(0, 0, *size, 0, 0, *size, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
+            GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, context.offFBO_r)
+        frame = np.empty((*size[::-1], 4), dtype=np.uint8)
+        GL.glReadPixels(0, 0, *size, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE, frame)
+        self.select()
+        return frame[::-1]
 
     def numbers(self) -> NDArray[np.int32]:
         """Number of the geom at each pixel (its `segid` plus 1, 0 for none), shape (height, width)."""
@@ -140,6 +172,14 @@ class Stage:
         self.scene = build_scene(anatomy, self.surface, instrument, options)
         self.canvas = Canvas(self.scene.model, self.scene.data, gl_context, more_geoms=LESIONS_MOST + 1)
         self._look = DrawnLook(self.scene, self.canvas.context, options)
+        self.style = options.style
+        self._shading: EndoscopicShading | None = None
+        self._is_seen_through = options.show_lesion
+        self._sceneries: dict[tuple, tuple[NDArray[np.uint8], float]] = {}
+        if self.style == "endoscopic":
+            self._shading = EndoscopicShading(options.width, options.height)
+            self.canvas.select()
+            self.scene.meshes[ABDOMEN].upload(abdomen(anatomy, self.scene.ground), self.canvas.context)
         # Labels of geoms beyond the model's, by their numbers in the picture.
         self._added: dict[int, int] = {}
 
@@ -151,6 +191,8 @@ class Stage:
         lesions: Sequence[tuple[FloatArray, FloatArray]],
         target: Disc | None,
         look: Look | None = None,
+        *,
+        in_colour: bool = True,
     ) -> None:
         """Upload the shapes and poses of a picture and aim its camera.
 
@@ -161,13 +203,21 @@ class Stage:
             lesions: centre [m] (3,) and half axes [m] (3,) of each solid lesion.
             target: a disc, None for none.
             look: of the picture; None: the scene's own.
+            in_colour: in the style of the stage; False: depth and labels are of the plain scene in every style.
         """
+        if self._shading is not None and in_colour:
+            self._background, self._aim = self._scenery(camera, self._shading)
         self._look.put_on(look)
         self.scene.instrument.pose(instrument, self.scene.data)
         self.canvas.select()
         for name, shape in shapes.items():
             self.scene.meshes[name].upload(shape, self.canvas.context)
-        self.canvas.look(camera, sky=look is not None or camera.sees_above_level())
+        is_plain = self._shading is None
+        self.canvas.look(
+            camera,
+            sky=is_plain and (look is not None or camera.sees_above_level()),
+            groups=PLAIN_GROUPS if is_plain or not in_colour else FRONT_GROUPS,
+        )
         self._added.clear()
         for centre, half_axes in lesions[:LESIONS_MOST]:
             self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, half_axes, centre, np.eye(3), LESION_COLOUR, "lesion")
@@ -175,6 +225,37 @@ class Stage:
             size = np.array([target.radius, 0.5 * TARGET_THICKNESS, 0.0])
             centre = target.centre - 0.5 * TARGET_THICKNESS * target.normal
             self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre, target.rotation, self._look.target_colour, "target")
+
+    def colour(self) -> NDArray[np.uint8]:
+        """Picture in the style of the stage, shape (height, width, 3)."""
+        if self._shading is None:
+            return self.canvas.colour()
+        with self._shading.used("tissue", self._aim):
+            front = self.canvas.layer()
+            frame = over(front, self._background)
+            if not self._is_seen_through:
+                return frame
+            drawn = self.canvas.drawn
+            hidden = {self.scene.meshes[name].geom for name in ("organ", "held")}
+            for geom in drawn.geoms[: drawn.ngeom]:
+                if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in hidden:
+                    geom.pos[:] = BEYOND
+            inside = over(self.canvas.layer(), frame)
+        # Lesions shine through the organ, and nothing beyond it does.
+        return np.rint(TRANSLUCENT * frame + (1.0 - TRANSLUCENT) * inside).astype(np.uint8)
+
+    def _scenery(self, camera: Camera, shading: EndoscopicShading) -> tuple[NDArray[np.uint8], float]:
+        """Picture of the abdomen alone, kept for each camera; distance of the aim [m]."""
+        key = camera.position.tobytes(), camera.rotation.tobytes(), camera.fov
+        if key not in self._sceneries:
+            if len(self._sceneries) == SCENERIES_MOST:
+                self._sceneries.pop(next(iter(self._sceneries)))
+            aim = float(np.linalg.norm(camera.target - camera.position))
+            self.canvas.select()
+            self.canvas.look(camera, sky=False, groups=[SCENERY_GROUP])
+            with shading.used("scenery", aim):
+                self._sceneries[key] = self.canvas.colour(), aim
+        return self._sceneries[key]
 
     def depth(self) -> NDArray[np.float32]:
         """Distance from the camera's plane [m], infinite for background, shape (height, width)."""
@@ -195,6 +276,12 @@ class Stage:
                 mesh.show(True, self.canvas.context)
             shown[(shown == LABELS["organ"]) & (inside == LABELS["lesion"])] = LABELS["lesion"]
         return shown
+
+    def close(self) -> None:
+        """Free the graphics context's memory."""
+        self.canvas.close()
+        if self._shading is not None:
+            self._shading.free()
 
     def _labels(self) -> NDArray[np.uint8]:
         numbers, drawn = self.canvas.numbers(), self.canvas.drawn
@@ -226,6 +313,20 @@ class Stage:
         drawn.ngeom += 1
 
 
+def over(front: NDArray[np.uint8], background: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Picture of a `Canvas.layer` (height, width, 4) before a background (height, width, 3)."""
+    frame = background.copy()
+    rows, columns = (np.flatnonzero(front[..., 3].any(axis=axis)) for axis in (1, 0))
+    if len(rows):
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        near = front[box]
+        # From 0 to 256, for a shift in place of a division.
+        free = 255 - near[..., 3:].astype(np.uint16)
+        free += free >> 7
+        frame[box] = near[..., :3] + ((frame[box] * free) >> 8).astype(np.uint8)
+    return frame
+
+
 def borrow_stage(anatomy: Anatomy, instrument: mujoco.MjModel, options: RenderOptions, gl_context: Any) -> Stage:
     """Stage shared by the simulations of one anatomy, for pictures of one size and kind; return it when done."""
     drawn = replace(options, camera="overview", show_force=True)
@@ -245,7 +346,7 @@ def give_back_stage(stage: Stage) -> None:
         if stage.users == 0:
             for key in [key for key, kept in _stages.items() if kept is stage]:
                 del _stages[key]
-                stage.canvas.close()
+                stage.close()
 
 
 @cache
@@ -256,4 +357,4 @@ def _close_all_at_exit() -> None:
 
 def _close_all() -> None:
     while _stages:
-        _stages.popitem()[1].canvas.close()
+        _stages.popitem()[1].close()

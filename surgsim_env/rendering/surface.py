@@ -31,6 +31,7 @@ class Shape:
         faces: vertices of the triangles, outward                                   (n_face, 3)
         face_places: places of their corners on a texture; None without one         (n_face, 3)
         shares: places on the scale of a painted field, 0 to 1; None without one    (n_vertex,)
+        rest: places of tissue at rest [m]; None of what is no tissue               (n_vertex, 3)
     """
 
     vertices: FloatArray
@@ -38,6 +39,7 @@ class Shape:
     faces: IntArray
     face_places: IntArray | None = None
     shares: FloatArray | None = None
+    rest: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

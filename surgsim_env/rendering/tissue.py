@@ -46,7 +46,8 @@ class Tissue:
         self.lesions = [lesion_ball(anatomy.mesh, lesion) for lesion in lesions]
         held = surface.faces_among(anatomy.anchors)
         self._faces = {"organ": surface.faces[~held], "held": surface.faces[held]}
-        _, places = texture_places(surface.follow(self._rest)[0], surface.faces)
+        self._vertex_rest = surface.follow(self._rest)[0]
+        _, places = texture_places(self._vertex_rest, surface.faces)
         self._face_places = {"organ": places[~held], "held": places[held]}
         self._cut = _CutAway(anatomy, surface, self.lesions, self._faces) if cut_away else None
 
@@ -54,8 +55,10 @@ class Tissue:
         """Surface and cut faces by their names in the scene, with the nodes at their positions [m] (n_node, 3)."""
         vertices, normals = self._surface.follow(node_position)
         if self._cut is None:
-            places = self._face_places
-            return {name: Shape(vertices, normals, faces, places[name]) for name, faces in self._faces.items()}
+            places, rest = self._face_places, self._vertex_rest
+            return {
+                name: Shape(vertices, normals, faces, places[name], rest=rest) for name, faces in self._faces.items()
+            }
         return self._cut.surfaces(vertices, normals) | self._cut.sections(node_position)
 
     def vertex_values(self, node_values: FloatArray) -> dict[str, FloatArray]:
@@ -84,6 +87,7 @@ class _CutAway:
         through, towards = cut_plane(anatomy, lesions)
         height = (surface.follow(mesh.points)[0] - through) @ towards
         self._surfaces = {name: clip_triangles(part, height) for name, part in faces.items()}
+        self._rest = {name: mix @ surface.follow(mesh.points)[0] for name, (mix, _) in self._surfaces.items()}
         mix, section = cut_tets(mesh, (mesh.points - through) @ towards)
         depth = np.full(len(mix.indptr) - 1, 1.0)
         for lesion in lesions:
@@ -99,7 +103,8 @@ class _CutAway:
         shapes = {}
         for name, (mix, faces) in self._surfaces.items():
             turned = mix @ normals
-            shapes[name] = Shape(mix @ vertices, turned / np.linalg.norm(turned, axis=1, keepdims=True), faces)
+            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+            shapes[name] = Shape(mix @ vertices, turned, faces, rest=self._rest[name])
         return shapes
 
     def vertex_values(self, values: FloatArray, node_values: FloatArray) -> dict[str, FloatArray]:

@@ -1,4 +1,4 @@
-"""Vessels on tissue: a procedural texture, and the texture coordinates of a surface."""
+"""Textures of tissue: vessels on a surface with its texture coordinates, and a solid field."""
 
 from functools import lru_cache
 
@@ -13,6 +13,8 @@ TEXTURE_SIZE, TEXTURE_WIDTH = 128, 0.06
 BANDWIDTH = 0.3
 # Colour of a vessel relative to the tissue's: darker and bluer.
 VESSEL_TINT = np.array([1.0, 1.25, 1.05])
+# Width of the solid field [voxels], and waves across it.
+FIELD_SIZE, FIELD_CYCLES = 64, 8.0
 # Texture coordinates of a vertex: one pair for each axis along which triangles are projected.
 AXIS_COUNT = 3
 
@@ -59,3 +61,23 @@ def texture_places(vertices: FloatArray, faces: IntArray) -> tuple[NDArray[np.fl
     axis = np.abs(normals).argmax(axis=1)
     places = np.stack([vertices[:, [1, 2]], vertices[:, [2, 0]], vertices[:, [0, 1]]], axis=1) / TEXTURE_WIDTH
     return places.reshape(-1, 2).astype(np.float32), (AXIS_COUNT * faces + axis[:, None]).astype(np.int32)
+
+
+@lru_cache(maxsize=1)
+def tissue_field() -> NDArray[np.uint8]:
+    """Random field of waves of about one length, and its gradient: mottling, vessels and bumps of solid tissue.
+
+    Returns:
+        Gradient and value (FIELD_SIZE, FIELD_SIZE, FIELD_SIZE, 4), 128 for 0; it repeats without a seam. The axes are
+        z, y, x, the gradient's entries x, y, z.
+    """
+    wave = np.fft.fftfreq(FIELD_SIZE, 1.0 / FIELD_SIZE)
+    cycles = np.stack(np.meshgrid(wave, wave, wave, indexing="ij")[::-1], axis=-1)
+    length = np.linalg.norm(cycles, axis=-1)
+    band = np.exp(-0.5 * ((length - FIELD_CYCLES) / (BANDWIDTH * FIELD_CYCLES)) ** 2)
+    waves = np.fft.fftn(np.random.default_rng(0).normal(size=length.shape)) * band
+    values = np.concatenate([2j * np.pi * cycles * waves[..., None], waves[..., None]], axis=-1)
+    values = np.fft.ifftn(values, axes=(0, 1, 2)).real
+    # Four standard deviations fill the scale.
+    values /= 4.0 * values.std(axis=(0, 1, 2))
+    return np.clip(np.rint(128.0 + 127.0 * values), 0, 255).astype(np.uint8)

@@ -211,3 +211,15 @@ def test_force_beside_the_picture_is_what_the_sensor_reads():
     assert not without.reset(seed=2)[0]["force"].any()
     env.close()
     without.close()
+
+
+@needs_opengl
+def test_observed_pictures_are_plain():
+    """Those of a renderer in the plain style, to the bit."""
+    drawn = {"render_mode": "rgb_array", "camera": "endoscope", "width": 84, "height": 84, "style": "plain"}
+    seen = gym.make(RETRACT, obs_mode="rgb").unwrapped
+    env = gym.make(RETRACT, **drawn, show_force=False, smooth_edges=False).unwrapped
+    env.reset(seed=2)
+    np.testing.assert_array_equal(seen.reset(seed=2)[0], env.render())
+    seen.close()
+    env.close()

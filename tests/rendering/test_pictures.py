@@ -9,9 +9,11 @@ import pytest
 from msdm_core.mesh.geodesic import NearestTriangle
 from surgsim_env.rendering import stage
 from surgsim_env.rendering.embedding import organ_surface
+from surgsim_env.rendering.looks import TRAIN, draw_look, look_generator
 from surgsim_env.rendering.options import CAMERAS, RenderOptions
 from surgsim_env.rendering.renderer import OrganRenderer
-from surgsim_env.rendering.stage import LABELS
+from surgsim_env.rendering.scene_model import ABDOMEN
+from surgsim_env.rendering.stage import FRONT_GROUPS, LABELS, SCENERY_GROUP
 
 pytestmark = pytest.mark.usefixtures("opengl")
 ORGAN, INSTRUMENT, LESION = (LABELS[name] for name in ("organ", "instrument", "lesion"))
@@ -212,3 +214,48 @@ def test_a_field_is_painted_where_it_is(press, draw, cut_away):
     # Within a radius of the ball, 50 to 60 pixels, around and below the contact.
     assert np.linalg.norm(np.median([columns, rows], axis=1) - place) < 60.0
     np.testing.assert_array_equal(draw(press, cut_away=cut_away).rgb(), plain)
+
+
+# ---- styles --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_the_abdomen_hides_nothing(press, draw, camera):
+    """Drawn among the organ and the instrument it is in front of neither; it fills the rest of the picture."""
+    renderer = draw(press, camera=camera)
+    labels, scene = renderer.segmentation(), renderer._stage.scene
+    with renderer._shown(renderer.cameras[camera]) as shown:
+        shown.canvas.look(renderer.cameras[camera], groups=[*FRONT_GROUPS, SCENERY_GROUP])
+        numbers, drawn = shown.canvas.numbers(), shown.canvas.drawn
+        geoms = drawn.geoms[: drawn.ngeom]
+    (abdomen,) = [geom.segid + 1 for geom in geoms if geom.segid >= 0 and geom.objid == scene.model.geom(ABDOMEN).id]
+    np.testing.assert_array_equal(numbers == abdomen, labels == LABELS["background"])
+
+
+@pytest.mark.parametrize("options", [{}, {"show_lesion": True}, {"cut_away": True}], ids=str)
+def test_styles_differ_in_colour_alone(press, draw, options):
+    """Depth and labels are of one geometry; the shadow on the plain style's drape lies 0.2 mm above it."""
+    press.press(0.003)
+    plain, shaded = (draw(press, style=style, show_force=False, **options) for style in ("plain", "endoscopic"))
+    assert (plain.rgb() != shaded.rgb()).any(axis=2).mean() > 0.9
+    np.testing.assert_array_equal(plain.segmentation(), shaded.segmentation())
+    np.testing.assert_allclose(plain.depth("above"), shaded.depth("above"), atol=3e-4)
+
+
+def test_looks_and_paint_are_drawn_in_the_plain_style(phantom, draw):
+    """To the bit, whatever the style, so that policies see what they were trained on."""
+    phantom.press(0.003)
+    look = draw_look(TRAIN, look_generator(TRAIN, 2))
+    for options in ({}, {"paint": "stress"}):
+        plain, shaded = draw(phantom, style="plain", **options), draw(phantom, **options)
+        own = shaded.rgb()
+        plain.look = shaded.look = look
+        np.testing.assert_array_equal(shaded.rgb(), plain.rgb())
+        shaded.look = None
+        np.testing.assert_array_equal(shaded.rgb(), own)
+
+
+def test_light_falls_off(phantom, draw):
+    """The wall of the abdomen, far behind the organ, is darker than the floor before it."""
+    frame = draw(phantom, camera="side", show_force=False).rgb().astype(float)
+    assert frame[:60, :100].mean() < 0.6 * frame[-80:, :100].mean()

@@ -17,9 +17,8 @@ from surgsim_apps.reports.surface_drawing import OrthographicView
 from surgsim_env.instruments import SIDES, load_arm
 from surgsim_env.scene import Anatomy, ArmDescription
 
-# Lengths of the moves [m], and points of the sample that each is tried at: chosen.
-STEPS = (0.01, 0.02)
-SAMPLE = 64
+# Length of the moves [m], and points of the sample that each is tried at: chosen.
+STEP, SAMPLE = 0.02, 64
 # Least gain of a move that is worth a new port, as a share of the points: chosen.
 GAIN_LEAST = 0.01
 
@@ -129,6 +128,5 @@ def port_shifts(ports: Ports, view: OrthographicView) -> Iterator[tuple[str, str
         along = axis - (axis @ normal) * normal
         along /= np.linalg.norm(along)
         for side in SIDES:
-            for step in STEPS:
-                for sign, words in ((1.0, ahead), (-1.0, back)):
-                    yield side, f"{step * 100:g} cm {words}", sign * step * along
+            for sign, words in ((1.0, ahead), (-1.0, back)):
+                yield side, f"{STEP * 100:g} cm {words}", sign * STEP * along

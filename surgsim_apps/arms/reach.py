@@ -161,7 +161,9 @@ class _Search:
                 # Without a usable one, the second round too begins at any candidate at the point.
                 usable = _every(clear)
                 begin = np.where(np.any(usable, axis=1, keepdims=True), usable, candidates.met)
-            lacking = ~directions_met(candidates.pointing, _every(clear), self.directions).all(axis=1)
+            lacking: NDArray[np.bool_] = ~np.all(
+                directions_met(candidates.pointing, _every(clear), self.directions), axis=1
+            )
             candidates, clear = self.with_directions(candidates, clear, begin, lacking)
         return candidates, clear
 

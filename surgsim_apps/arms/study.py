@@ -19,6 +19,7 @@ from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.quantities import QUANTITIES
 from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.reach import (
+    Found,
     Sites,
     evaluate_both,
     evaluate_reach,
@@ -120,7 +121,7 @@ def evaluate_arms(
     if moves and not both.reachable[~sites.inner].all():
         with progress.step("moving the ports"):
             search = PortSearch(dict(zip(SIDES, (left, right))), anatomy, organ, sites)
-            found = dict(zip(SIDES, reaches))
+            found: dict[str, Found] = dict(zip(SIDES, reaches))
             move = search.best_move(where, found, both.reachable, camera_view(evaluation))
         evaluation = replace(evaluation, move=move, moves_tried=True)
     if picture:

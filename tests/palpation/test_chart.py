@@ -5,9 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_env.palpation.chart import MAP_SIDE, ChartedFace, HealthyMap, charted_face, make_chart
+from surgsim_env.palpation.chart import (
+    MAP_SIDE,
+    ChartedFace,
+    HealthyMap,
+    _shipped,
+    charted_face,
+    healthy_file,
+    make_chart,
+    map_digest,
+)
 from surgsim_env.scene.anatomy import load_anatomy
-from surgsim_env.scene.load import make_scene
+from surgsim_env.scene.load import make_scene, with_instrument
 
 
 def test_the_phantoms_chart_is_its_top_less_the_margin():
@@ -96,3 +105,9 @@ def test_no_site_lies_under_a_ligament():
     sites = [*charted.grid_sites(), *(charted.site(touch_map.places[number]) for number in covered)]
     assert min(np.linalg.norm(held - site.point, axis=1).min() for site in sites) > tip
     assert min(site.moved for site in sites[-len(covered) :]) > 0.0
+
+
+def test_the_healthy_map_beside_the_liver_is_of_its_organ():
+    """If not, `write_healthy_map` (scenes/README.md) makes it anew."""
+    anatomy = load_anatomy(with_instrument(make_scene("liver"), "probe"))
+    assert _shipped(healthy_file(anatomy.scene.folder / "liver.toml"), map_digest(anatomy)) is not None

@@ -46,7 +46,7 @@ def write_report(
         ranking_rule=RANKING_RULE,
         number_text=number_text,
         scene=evaluation.turning,
-        poster=(*pictures, *maps)[0],
+        poster=next(iter((*pictures, *maps)), None),
         pictures=pictures,
         maps=maps,
         colours={**PORT_COLOURS, "both": REACH_KINDS[0].colour},

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from msdm_core.mesh.tet_mesh import TetMesh
-from surgsim_apps.arms.clearance import TIP_ZONE
+from surgsim_apps.arms.clearance import WORKING_ZONE
 from surgsim_apps.arms.ports import (
     CAMERA_DISTANCE,
     PORT_SPACING,
@@ -115,7 +115,7 @@ def test_mujoco_agrees_with_what_is_reported(evaluation, phantom):
             ends = arm.shape_ends(joints)
             along = np.linspace(0.0, 1.0, 2001)[:, None]
             axes = ends[:, None, 0] + along * (ends[:, None, 1] - ends[:, None, 0])
-            outside = np.linalg.norm(axes - tip, axis=2) > ball + TIP_ZONE
+            outside = np.linalg.norm(axes - tip, axis=2) > ball + WORKING_ZONE
             beyond = np.maximum(np.abs(axes - [0.03, 0.03, 0.015]) - [0.03, 0.03, 0.015], 0.0)
             gaps = np.where(outside, np.linalg.norm(beyond, axis=2), np.inf) - arm.shape_radius[:, None]
             assert report.organ_clearance[row] == pytest.approx(gaps.min(), abs=5e-5)

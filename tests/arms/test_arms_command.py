@@ -42,7 +42,7 @@ def made(monkeypatch):
     """In place of the evaluation, made-up ones: wider ports reach more, another arm less. Lists what was asked for."""
     asked = []
 
-    def evaluate(anatomy, left, right, ports, *, seed, count, progress, picture):
+    def evaluate(anatomy, left, right, ports, *, seed, count, progress, picture, moves):
         asked.append((left, right, ports))
         reach = 0.6 if ports.left.point[0] < -0.05 else 0.1 if left.name == "six_axis" else 0.3
         return made_evaluation(count=count, seed=seed, left_to=reach, right_to=reach)

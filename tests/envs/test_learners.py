@@ -88,6 +88,7 @@ VALUES = {
     "cut_away": True,
     "smooth_edges": False,
     "paint": "stress",
+    "style": "plain",
     "motion": "calm",
     "level": "hard",
     "split": None,

@@ -17,8 +17,8 @@ from surgsim_apps.reports.surface_drawing import OrthographicView
 from surgsim_env.instruments import SIDES, load_arm
 from surgsim_env.scene import Anatomy, ArmDescription
 
-# Length of the moves [m], and points of the sample that each is tried at: chosen.
-STEP, SAMPLE = 0.02, 64
+# Length of the moves [m], points of the sample that each is tried at, and of the one that confirms the best: chosen.
+STEP, SAMPLE, SAMPLE_CONFIRMING = 0.02, 32, 128
 # Least gain of a move that is worth a new port, as a share of the points: chosen.
 GAIN_LEAST = 0.01
 
@@ -72,8 +72,7 @@ class PortSearch:
     ) -> PortMove | None:
         """The move of one port that adds most to the surface's points that both arms reach at once.
 
-        Each move is tried at a sample: the points that both do not reach yet as far as half of it, and spread ones. The
-        best is confirmed at all points. The other arm stays as it was found.
+        Each move is tried at a sample, the best is confirmed at a larger one. The other arm stays as it was found.
 
         Args:
             ports: before the move.
@@ -85,17 +84,13 @@ class PortSearch:
             The move; None if none adds GAIN_LEAST.
         """
         surface = np.flatnonzero(~self.sites.inner)
-        missing, had = surface[~both[surface]], surface[both[surface]]
-        first = missing[: max(SAMPLE // 2, SAMPLE - len(had))]
-        rows = np.concatenate([first, had[: SAMPLE - len(first)]])
-        # Each point of the sample stands for as many of its kind.
-        weight = np.where(both[rows], len(had) / max(len(rows) - len(first), 1), len(missing) / max(len(first), 1))
+        rows, weight = _sample(surface, both, SAMPLE)
         least = float(both[surface].mean()) + GAIN_LEAST
         best = None
         for side, words, shift in port_shifts(ports, view):
             try:
                 moved = moved_port(ports, side, shift)
-                estimate = float(weight @ self.both_reach(side, moved, found, rows)) / len(surface)
+                estimate = float(weight @ self.both_reach(side, moved, found, rows))
             except ValueError:
                 continue  # inside the organ, or too far from the other port
             if estimate > (best[0] if best else least):
@@ -103,8 +98,20 @@ class PortSearch:
         if best is None:
             return None
         _, side, words, shift = best
-        after = float(self.both_reach(side, moved_port(ports, side, shift), found, surface).mean())
+        rows, weight = _sample(surface, both, SAMPLE_CONFIRMING)
+        after = float(weight @ self.both_reach(side, moved_port(ports, side, shift), found, rows))
         return PortMove(side, words, shift, least - GAIN_LEAST, after) if after >= least else None
+
+
+def _sample(
+    surface: NDArray[np.integer], both: NDArray[np.bool_], count: int
+) -> tuple[NDArray[np.integer], FloatArray]:
+    """Points of the surface, up to half of them not yet reached by both, and the share that each stands for."""
+    missing, had = surface[~both[surface]], surface[both[surface]]
+    first = missing[: max(count // 2, count - len(had))]
+    rows = np.concatenate([first, had[: count - len(first)]])
+    counts = np.where(both[rows], len(had) / max(len(rows) - len(first), 1), len(missing) / max(len(first), 1))
+    return rows, counts / len(surface)
 
 
 def moved_port(ports: Ports, side: str, shift: FloatArray) -> Ports:

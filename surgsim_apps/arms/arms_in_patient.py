@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -22,9 +23,9 @@ from surgsim_env.rendering import DrawnCapsule, draw_still
 from surgsim_env.scene import tangent_axes
 
 SIZE = 960, 720
-ORGAN, WALL = "#b8584a", "#d9a68c"
+ORGAN, WALL, OBSTACLE, GIVEN = "#b8584a", "#d9a68c", "#8c8c8c", "#f0e442"
 # The wall is fainter in the picture, which shows the whole dome.
-ORGAN_OPACITY, WALL_OPACITY, DOME_OPACITY = 0.6, 0.3, 0.18
+ORGAN_OPACITY, WALL_OPACITY, DOME_OPACITY, SKIN_OPACITY = 0.6, 0.3, 0.18, 0.15
 SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
 # Length of the drawn endoscope outside its port, and of the drawn wall beyond the ports [m].
 SCOPE_OUTSIDE, WALL_BEYOND = 0.18, 0.05
@@ -44,6 +45,7 @@ class ArmsInPatient:
         joints: of each [rad or m]
         where: what they do, in words
         ports: theirs and the endoscope's
+        given: other ports, to show beside them
     """
 
     evaluation: ArmsEvaluation
@@ -51,18 +53,20 @@ class ArmsInPatient:
     joints: tuple[FloatArray, ...]
     where: str
     ports: Ports
+    given: Ports | None = None
 
     @classmethod
     def at_middle(
-        cls, evaluation: ArmsEvaluation, arms: tuple[Arm, ...], both: BothArms, ports: Ports
+        cls, evaluation: ArmsEvaluation, arms: tuple[Arm, ...], both: BothArms, ports: Ports, given: Ports | None = None
     ) -> "ArmsInPatient":
         """Both tips at a point that both reach at once, nearest to the middle of these; without one both at home."""
         rows = np.flatnonzero(both.reachable & ~evaluation.inner)
         if not rows.size:
-            return cls(evaluation, arms, tuple(arm.home for arm in arms), "at home", ports)
+            return cls(evaluation, arms, tuple(arm.home for arm in arms), "at home", ports, given)
         points = evaluation.points[rows]
         row = rows[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()]
-        return cls(evaluation, arms, tuple(joints[row] for joints in both.joints), "with both tips at one point", ports)
+        joints = tuple(values[row] for values in both.joints)
+        return cls(evaluation, arms, joints, "with both tips at one point", ports, given)
 
     def picture(self) -> NDArray[np.uint8]:
         """A picture (720, 960, 3) from beside the table.
@@ -80,7 +84,7 @@ class ArmsInPatient:
             DrawnCapsule(ends, radius, to_rgba(colour)) for _, ends, radius, colour in self._endoscope_and_ports()
         ]
         wall = self.ports.wall
-        if not wall.plate:
+        if self.ports.has_dome:
             dome = np.stack([self.ports.dome_centre] * 2)
             capsules.append(DrawnCapsule(dome, wall.radius, to_rgba(WALL, DOME_OPACITY)))
         away, up = self._view()
@@ -91,7 +95,7 @@ class ArmsInPatient:
 
     def scene(self) -> TurningScene:
         """A scene that turns: organ, points in the colours of REACH_KINDS, arms as they are evaluated, ports, wall."""
-        evaluation, parts = self.evaluation, []
+        evaluation, wall, parts = self.evaluation, self.ports.wall, []
         spacing = KDTree(evaluation.points[:MARKS_MOST]).query(evaluation.points[:MARKS_MOST], k=2)[0][:, 1]
         radius = MARK_SHARE * float(np.median(spacing))
         for index, kind in enumerate(REACH_KINDS):
@@ -106,9 +110,16 @@ class ArmsInPatient:
             parts.append(capsules_part(f"{side} arm", ends, arm.shape_radius, PORT_COLOURS[side]))
         for name, ends, radius, colour in self._endoscope_and_ports():
             parts.append(capsules_part(name, [ends], [radius], colour))
+        if self.given is not None:
+            for name, port in self.given.frames.items():
+                parts.append(marks_part(f"given {name} port", np.array([port.point]), PORT_RADIUS, GIVEN))
         parts.append(SolidPart("organ", evaluation.surface_points, evaluation.surface_triangles, ORGAN, ORGAN_OPACITY))
-        if not self.ports.wall.plate:
+        if self.ports.has_dome:
             parts.append(self._dome())
+        if wall.skin is not None:
+            parts.append(SolidPart("body wall", *wall.skin.read(), WALL, SKIN_OPACITY))
+        for source in self.ports.obstacles:
+            parts.append(SolidPart(Path(source.file).stem, *source.read(), OBSTACLE))
         away, up = self._view()
         view, outer = OrthographicView.along(-away, up), ~evaluation.inner
         legend = [
@@ -117,6 +128,7 @@ class ArmsInPatient:
         ]
         description = (
             f"Both arms {self.where}, as the shapes that are evaluated, in the colours of what each reaches alone."
+            + ("" if self.given is None else " Yellow: the given ports.")
         )
         return turning_scene(parts, view, description, legend)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.arms.kinematics import BatchKinematics, Chain, cross, dot
 from surgsim_apps.arms.ports import Ports
+from surgsim_env.scene import Anatomy
 
 # Triangles of one cluster; pairs of segment and triangle in one batch.
 CLUSTER_SIZE = 24
@@ -172,13 +173,46 @@ def outside_ball(segments: FloatArray, centre: FloatArray, radius: float) -> tup
     return parts, left
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Obstacles of an arm: organ at rest and body wall; the tip, of radius `ball` [m], may touch."""
+    """Obstacles of an arm: organ, body wall and others; the tip may touch the organ.
+
+    Fields:
+        organ: its surface
+        ports: with the wall
+        ball: radius of the arm's tip [m]
+        skin: surface of the wall; None for a dome or plate
+        others: further surfaces
+    """
 
     organ: ClusteredSurface
     ports: Ports
-    ball: float
+    ball: float = 0.0
+    skin: ClusteredSurface | None = None
+    others: tuple[ClusteredSurface, ...] = ()
+
+    @classmethod
+    def of(cls, anatomy: Anatomy, ports: Ports) -> "Obstacles":
+        """Obstacles of a scene's organ at rest and of the surfaces of a ports file.
+
+        Raises:
+            MeshError: a surface that cannot be read.
+        """
+        mesh, skin = anatomy.mesh, ports.wall.skin
+        return cls(
+            ClusteredSurface(mesh.points, mesh.boundary_triangles),
+            ports,
+            skin=None if skin is None else ClusteredSurface(*skin.read()),
+            others=tuple(ClusteredSurface(*source.read()) for source in ports.obstacles),
+        )
+
+    def clears_others(self, kinematics: BatchKinematics, shape_ends: FloatArray) -> NDArray[np.bool_]:
+        """Mask of poses with shapes (n, n_shape, 2, 3) [m] clear of the further surfaces, (n,)."""
+        clear = np.ones(len(shape_ends), dtype=bool)
+        for surface in self.others:
+            for shape, radius in enumerate(kinematics.arm.shape_radius):
+                clear &= surface.distance(shape_ends[:, shape], radius) >= radius
+        return clear
 
     def clears_organ(self, kinematics: BatchKinematics, chain: Chain) -> NDArray[np.bool_]:
         """Mask of poses that touch the organ with the tip's zone alone, (n,)."""
@@ -200,18 +234,28 @@ class Obstacles:
 
     def wall_clearance(self, kinematics: BatchKinematics, chain: Chain) -> FloatArray:
         """Distance of all shapes outside the port's hole from the body wall [m], (n,)."""
-        gaps = wall_clearance(self.ports, chain.shape_ends, kinematics.trocar) - kinematics.arm.shape_radius
+        return self.wall_gap(kinematics, chain.shape_ends, kinematics.trocar)
+
+    def wall_gap(self, kinematics: BatchKinematics, shape_ends: FloatArray, trocar: FloatArray) -> FloatArray:
+        """Distance of shapes (n, n_shape, 2, 3) from the wall [m], (n,), at a trocar (3,) or one a row (n, 1, 3)."""
+        gaps = wall_clearance(self.ports, shape_ends, trocar, self.skin) - kinematics.arm.shape_radius
         return gaps.min(axis=1)
 
 
-def wall_clearance(ports: Ports, segments: FloatArray, trocar: FloatArray) -> FloatArray:
+def wall_clearance(
+    ports: Ports, segments: FloatArray, trocar: FloatArray, skin: ClusteredSurface | None = None
+) -> FloatArray:
     """Distances of segments (..., 2, 3) from the wall [m]; negative within it, inf inside the hole.
 
     With heights from h0 to h1 above the wall's middle surface and a thickness t: max(h0 - t/2, -t/2 - h1), the gap, or
-    minus the shortest move out of the wall.
+    minus the shortest move out of the wall. Of a skin: the distance from its surface less t/2.
     """
     wall, half = ports.wall, 0.5 * ports.wall.thickness
     parts, left = outside_ball(segments, trocar, wall.hole)
+    if skin is not None:
+        distance = np.full(left.shape, np.inf)
+        distance[left] = skin.distance(parts[left])
+        return distance.min(axis=-1) - half
     if wall.plate:
         middle = 0.5 * (np.array(ports.left.point) + np.array(ports.right.point))
         heights = (parts - middle) @ ports.wall_normal
@@ -246,9 +290,14 @@ def split_at_trocar(kinematics: BatchKinematics, chain: Chain) -> tuple[FloatArr
 
 
 def arm_distances(
-    first: tuple[BatchKinematics, Chain], second: tuple[BatchKinematics, Chain], points: FloatArray
+    first: tuple[BatchKinematics, Chain],
+    second: tuple[BatchKinematics, Chain],
+    points: FloatArray,
+    cap: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Smallest distances of two arms inside and outside the body [m], each (n,), their tips at the same points (n, 3).
+    """Smallest distances of two arms inside and outside the body, each (n,), their tips at the same points (n, 3) [m].
+
+    At most `cap` [m]: a small one is quick.
 
     Each arm's own trocar divides its shapes into inside and outside; parts within WORKING_ZONE of the
     point are left out.
@@ -261,11 +310,19 @@ def arm_distances(
         parts[~left] = np.nan
         inside.append(parts.reshape(len(segments), -1, 2, 3))
     outside = [piece[1] for piece in pieces]
-    return _least(inside, [np.repeat(radius, 2) for radius in radii]), _least(outside, radii)
+    return _least(inside, [np.repeat(radius, 2) for radius in radii], cap), _least(outside, radii, cap)
 
 
-def _least(segments: list[FloatArray], radii: list[FloatArray]) -> FloatArray:
-    """Smallest clearance of two sets of capsules (n, k, 2, 3), (n, l, 2, 3) [m], (n,); inf for an empty set."""
-    with np.errstate(invalid="ignore"):
-        gaps = segment_distance(segments[0][:, :, None], segments[1][:, None]) - radii[0][:, None] - radii[1]
-    return np.where(np.isnan(gaps), np.inf, gaps).min(axis=(1, 2))
+def _least(segments: list[FloatArray], radii: list[FloatArray], cap: float) -> FloatArray:
+    """Smallest clearance of two sets of capsules (n, k, 2, 3), (n, l, 2, 3), at most `cap` [m], (n,); NaN are none."""
+    middles = [ends.mean(axis=2) for ends in segments]
+    # Half a capsule's length and its radius: no part is further from its middle.
+    extents = [
+        0.5 * np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) + radius
+        for ends, radius in zip(segments, radii, strict=True)
+    ]
+    between = np.linalg.norm(middles[0][:, :, None] - middles[1][:, None], axis=3)
+    row, a, b = np.nonzero(between - extents[0][:, :, None] - extents[1][:, None] < cap)
+    result = np.full(len(between), cap)
+    np.minimum.at(result, row, segment_distance(segments[0][row, a], segments[1][row, b]) - radii[0][a] - radii[1][b])
+    return result

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray, IntArray
 from surgsim_env.instruments import Arm
@@ -32,6 +33,22 @@ class Chain:
     shape_ends: FloatArray
     axes: FloatArray
     anchors: FloatArray
+
+    def only(self, rows: NDArray) -> "Chain":
+        """Some of the sets."""
+        return Chain(*(values[rows] for values in vars(self).values()))
+
+    def moved(self, turns: FloatArray, shifts: FloatArray) -> "Chain":
+        """Each set turned by a rotation (n, 3, 3), then shifted (n, 3) [m]."""
+
+        def turned(vectors: FloatArray) -> FloatArray:
+            return np.einsum("nij,n...j->n...i", turns, vectors)
+
+        ends = turned(self.shape_ends) + shifts[:, None, None]
+        tip, near, anchors = turned(self.tip) + shifts, turned(self.near) + shifts, turned(self.anchors)
+        return Chain(
+            tip, turned(self.direction), near, turned(self.along), ends, turned(self.axes), anchors + shifts[:, None]
+        )
 
 
 class BatchKinematics:

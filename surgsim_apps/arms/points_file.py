@@ -1,4 +1,4 @@
-"""The file points.csv: one line for each point of an evaluation."""
+"""The files points.csv, a line for each point of an evaluation, and placements.csv, one for each of a search."""
 
 import csv
 from collections.abc import Iterable
@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgsim_apps.arms.quantities import DISTANCES, QUANTITIES
-from surgsim_apps.arms.results import REASONS, ArmsEvaluation
+from surgsim_apps.arms.results import REASONS, ArmsEvaluation, PortsFound
+from surgsim_env.instruments import SIDES
 
 
 def columns(evaluation: ArmsEvaluation) -> dict[str, list[str]]:
@@ -34,8 +35,25 @@ def columns(evaluation: ArmsEvaluation) -> dict[str, list[str]]:
 
 
 def write_points(evaluation: ArmsEvaluation, path: Path) -> None:
-    """Write the file."""
-    cells = columns(evaluation)
+    """Write points.csv."""
+    _write(columns(evaluation), path)
+
+
+def write_placements(search: PortsFound, path: Path) -> None:
+    """Write placements.csv: the best placement, then the Pareto front."""
+    placements = (search.best, *search.front)
+    cells = {"placement": ["best", *map(str, range(1, len(placements)))]}
+    for name, unit in (("share", ""), ("clearance", "_m"), ("dexterity", "")):
+        cells[f"{name}{unit}"] = _numbers(getattr(each, name) for each in placements)
+    for name in (*SIDES, "endoscope"):
+        places = [getattr(each.ports, name) for each in placements]
+        cells |= {f"{name}_{axis}_m": _numbers(place.point[row] for place in places) for row, axis in enumerate("xyz")}
+        if name in SIDES:
+            cells[f"{name}_roll_rad"] = _numbers(place.roll for place in places)
+    _write(cells, path)
+
+
+def _write(cells: dict[str, list[str]], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(cells)

@@ -50,35 +50,19 @@ class Sites:
 
 
 @dataclass(frozen=True)
-class Found:
+class Reach:
     """Joint values of an arm for n points.
 
     Fields:
         kinematics: of the arm
         candidates: k for each point
-        usable: mask of those past every test                           (n, k)
-        joints: of the usable one furthest from limits [rad or m]       (n, n_joint)
+        usable: mask of those past every test               (n, k)
+        report: its figures
     """
 
     kinematics: BatchKinematics
     candidates: Candidates
     usable: NDArray[np.bool_]
-    joints: FloatArray
-
-    @property
-    def reachable(self) -> NDArray[np.bool_]:
-        """Mask of points in reach, (n,)."""
-        return np.any(self.usable, axis=1)
-
-    def only(self, rows: NDArray) -> "Found":
-        """Some of the points."""
-        return Found(self.kinematics, self.candidates.only(rows), self.usable[rows], self.joints[rows])
-
-
-@dataclass(frozen=True)
-class Reach(Found):
-    """Joint values of an arm, and its report."""
-
     report: ArmReach
 
 
@@ -105,25 +89,7 @@ def evaluate_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles)
     candidates, clear = search.all_around(candidates, search.clear(candidates, candidates.met))
     usable = _every(clear)
     report = _report(search, candidates, usable, _reasons(search, candidates, clear))
-    return Reach(kinematics, candidates, usable, report.joints, report)
-
-
-def find_reach(kinematics: BatchKinematics, sites: Sites, around: Obstacles, *, thorough: bool = False) -> Found:
-    """Joint values of one arm for every site, by a search that ends at the first usable ones of each.
-
-    It takes a twentieth of the time of `evaluate_reach`, for the same points in reach (but for those that only a second
-    round of directions finds: none of 1500 on the liver). A thorough search goes on to all directions at every site.
-    """
-    search, candidates = _begin(kinematics, sites, around)
-    clear = np.zeros((3, *candidates.met.shape), dtype=bool)
-    for place in np.eye(candidates.met.shape[1], dtype=bool):
-        open_points = ~np.any(_every(clear), axis=1, keepdims=True)
-        clear |= search.clear(candidates, candidates.met & open_points & place)
-    wanted = thorough | ~np.any(_every(clear), axis=1)
-    candidates, clear = search.with_directions(candidates, clear, candidates.met, wanted)
-    usable = _every(clear)
-    widest = _widest(kinematics, candidates, usable)
-    return Found(kinematics, candidates, usable, candidates.joints[np.arange(len(usable)), widest])
+    return Reach(kinematics, candidates, usable, report)
 
 
 def _begin(kinematics: BatchKinematics, sites: Sites, around: Obstacles) -> tuple["_Search", Candidates]:
@@ -182,8 +148,8 @@ class _Search:
         return candidates.add(added), np.concatenate([clear, self.clear(added, added.met)], axis=2)
 
     def clear(self, candidates: Candidates, tried: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Masks of tried candidates (n, k): all, those clear of the organ, and those clear of the wall, (3, n, k)."""
-        result = np.zeros((3, *tried.shape), dtype=bool)
+        """Masks of tried candidates (n, k): all, and those clear of the organ, the wall and others, (4, n, k)."""
+        result = np.zeros((4, *tried.shape), dtype=bool)
         result[0] = tried
         points, places = np.nonzero(tried)
         for low in range(0, len(points), CANDIDATES_AT_ONCE):
@@ -192,6 +158,7 @@ class _Search:
             off_organ = self.around.clears_organ(self.kinematics, chain)
             result[1, point, place] = off_organ | self.sites.inner[point]
             result[2, point, place] = self.around.wall_clearance(self.kinematics, chain) >= 0.0
+            result[3, point, place] = self.around.clears_others(self.kinematics, chain.shape_ends)
         return result
 
 
@@ -211,6 +178,7 @@ def _reasons(search: _Search, candidates: Candidates, clear: NDArray[np.bool_]) 
     """Index into REASONS of each point: the first test without a passing candidate, (n,)."""
     kinematics, tips = search.kinematics, search.tips
     reason = np.where(np.any(_every(clear[:2]), axis=1), 5, 4)
+    reason[np.any(_every(clear[:3]), axis=1)] = 6
     reason[np.any(_every(clear), axis=1)] = 0
     lost = np.flatnonzero(~np.any(clear[0], axis=1))
     if lost.size:
@@ -277,11 +245,11 @@ class BothArms:
     joints: tuple[FloatArray, FloatArray]
 
 
-def evaluate_both(left: Found, right: Found, points: FloatArray) -> BothArms:
+def evaluate_both(left: Reach, right: Reach, points: FloatArray) -> BothArms:
     """Points in reach of both arms at once: with the reported joints, else with the best of 6 x 6 other pairs."""
     inside, outside = np.full(len(points), np.nan), np.full(len(points), np.nan)
-    joints = left.joints.copy(), right.joints.copy()
-    rows = np.flatnonzero(left.reachable & right.reachable)
+    joints = left.report.joints.copy(), right.report.joints.copy()
+    rows = np.flatnonzero(left.report.reachable & right.report.reachable)
     if rows.size:
         kinematics = left.kinematics, right.kinematics
         inside[rows], outside[rows] = pair_distances(kinematics, (joints[0][rows], joints[1][rows]), points[rows])
@@ -300,7 +268,7 @@ def evaluate_both(left: Found, right: Found, points: FloatArray) -> BothArms:
         return BothArms(np.minimum(inside, outside) >= ARM_DISTANCE, inside, outside, joints)
 
 
-def ways(arm: Found, rows: NDArray) -> FloatArray:
+def ways(arm: Reach, rows: NDArray) -> FloatArray:
     """Joint values of usable candidates, the furthest from limits to the nearest, (len(rows), WAYS, n_joint)."""
     usable = arm.usable[rows]
     margin = np.where(usable, limit_margin(arm.kinematics, arm.candidates.joints[rows]), -np.inf)

@@ -12,7 +12,7 @@ from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.quantities import DISTANCES, QUANTITIES, spread
 from surgsim_apps.arms.ranking import RANKING_RULE, Ranked
 from surgsim_apps.arms.reach_kinds import PORT_COLOURS, REACH_KINDS
-from surgsim_apps.arms.results import REASONS, ArmsEvaluation, ThroughCycle
+from surgsim_apps.arms.results import REASONS, ArmsEvaluation, PortsFound, ThroughCycle
 from surgsim_apps.arms.wording import number_text, share_text, verdict
 from surgsim_apps.reports.html_page import Picture, render_page
 
@@ -56,10 +56,47 @@ def write_report(
         distances=[(title, *_spread_texts(getattr(evaluation, field), 1e3, 1)) for field, title, _ in DISTANCES],
         reasons=_reasons(evaluation),
         cycle=cycle_section(evaluation),
+        ports=_ports(evaluation),
+        search=_search(evaluation.search),
         definitions=_definitions(),
         command=command,
     )
     path.write_text(page, encoding="utf-8", newline="\n")
+
+
+def _ports(evaluation: ArmsEvaluation) -> Rows:
+    """Places of the ports for the theatre [mm]: coordinates, distances from the given port and the other ports."""
+    rows, frames = [], evaluation.ports
+    given = None if evaluation.search is None else evaluation.search.given.ports.frames
+    for name, port in frames.items():
+        others = [math.dist(port.point, other.point) for key, other in frames.items() if key != name]
+        moved = "–" if given is None else number_text(math.dist(port.point, given[name].point), 1e3, 0)
+        places = [number_text(value, 1e3, 0) for value in port.point]
+        rows.append((name, *places, moved, *(number_text(value, 1e3, 0) for value in others)))
+    return rows
+
+
+def _search(search: PortsFound | None) -> dict[str, Any] | None:
+    """Contents of the report on a search for ports; None without one."""
+    if search is None:
+        return None
+    rows = [("given", search.given), ("found", search.best)]
+    rows += [(f"front {number}", placement) for number, placement in enumerate(search.front, start=1)]
+    return {
+        "count": search.count,
+        "gains": {side: _per_cent(share) for side, share in search.gains.items()},
+        "given": _per_cent(search.given.share),
+        "best": _per_cent(search.best.share),
+        "rows": [
+            (
+                name,
+                _per_cent(placement.share),
+                number_text(placement.clearance, 1e3, 1),
+                number_text(placement.dexterity, 1.0, 3),
+            )
+            for name, placement in rows
+        ],
+    }
 
 
 def _shares(evaluation: ArmsEvaluation) -> Rows:

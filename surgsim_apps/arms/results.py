@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msdm_core.mesh import FloatArray, IntArray
+from surgsim_apps.arms.ports import Ports
 from surgsim_apps.reports.turning_scene import TurningScene
 from surgsim_env.instruments import SIDES
 from surgsim_env.scene import Port
 
 # Reasons why an arm does not reach a point, in the order of the tests; 0 is reachable.
 REASONS = ("reachable", "no joints put the tip there", "a joint limit", "the shaft misses its trocar",
-           "the arm touches the organ", "the arm touches the wall")  # fmt: skip
+           "the arm touches the organ", "the arm touches the wall", "the arm touches another obstacle")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,41 @@ class PortMove:
 
 
 @dataclass(frozen=True)
+class Placement:
+    """A placement of the search, its figures estimated by `QuickReach`.
+
+    Fields:
+        ports: of both arms and the endoscope
+        share: of the points in reach of both arms at once
+        clearance: median distance of the arms from organ, wall and each other, up to 20 mm [m]
+        dexterity: median isotropy of the less isotropic arm
+    """
+
+    ports: Ports
+    share: float
+    clearance: float
+    dexterity: float
+
+
+@dataclass(frozen=True)
+class PortsFound:
+    """Result of a search.
+
+    Fields:
+        given, best: placement to begin with, and the one of the greatest worth
+        front: no placement of the search is better in one figure and not worse in the others; most reach first
+        gains: share of the points that both reach, with one port moved from given to best, by side
+        count: number of placements tried
+    """
+
+    given: Placement
+    best: Placement
+    front: tuple[Placement, ...]
+    gains: dict[str, float]
+    count: int
+
+
+@dataclass(frozen=True)
 class ArmsEvaluation:
     """Both arms on one scene.
 
@@ -151,6 +187,7 @@ class ArmsEvaluation:
         cycle: both arms while the patient breathes; None for a motionless one
         move: of a port, that lets both reach more; None where no move is worth it, or none was tried
         moves_tried: True if moves of the ports were tried
+        search: for the ports; None without one
         picture: of the arms in the patient, RGB, (height, width, 3) uint8; None without one
         turning: scene of the arms in the patient; None without one
     """
@@ -170,6 +207,7 @@ class ArmsEvaluation:
     cycle: ThroughCycle | None = None
     move: PortMove | None = None
     moves_tried: bool = False
+    search: PortsFound | None = None
     picture: NDArray[np.uint8] | None = None
     turning: TurningScene | None = None
 

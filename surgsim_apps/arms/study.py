@@ -1,6 +1,6 @@
 """Evaluation of two arms on a patient's anatomy, and a study of several setups with its files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,37 +10,42 @@ from rich.console import Console
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.arms_in_patient import ArmsInPatient
-from surgsim_apps.arms.clearance import ClusteredSurface, Obstacles
+from surgsim_apps.arms.capability import Capability, quartered
+from surgsim_apps.arms.clearance import Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.pictures import ArmMaps, camera_view, write_picture
-from surgsim_apps.arms.points_file import write_points
-from surgsim_apps.arms.port_moves import PortSearch
+from surgsim_apps.arms.points_file import write_placements, write_points
+from surgsim_apps.arms.port_moves import best_move
+from surgsim_apps.arms.port_search import PortSearch, on_one_wall
 from surgsim_apps.arms.ports import Ports, default_ports, read_ports
 from surgsim_apps.arms.quantities import QUANTITIES
+from surgsim_apps.arms.quick_reach import QuickReach
 from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.reach import (
-    Found,
     Sites,
     evaluate_both,
     evaluate_reach,
     tip_ball,
 )
 from surgsim_apps.arms.report import write_report
-from surgsim_apps.arms.results import ArmsEvaluation
+from surgsim_apps.arms.results import ArmsEvaluation, PortsFound
 from surgsim_apps.arms.through_cycle import evaluate_cycle
 from surgsim_apps.arms.wording import verdict
 from surgsim_apps.reports.output_folder import AnyFolder
 from surgsim_env.instruments import SIDES, load_arm
 from surgsim_env.rendering import NoGLError
-from surgsim_env.scene import Anatomy, ArmDescription, Scene, load_anatomy, make_scene
+from surgsim_env.scene import Anatomy, ArmDescription, Scene, as_toml, load_anatomy, make_scene
 from surgsim_env.step_progress import StepProgress
 
 # Candidates for each point.
 PLACES_PER_POINT = 12
+# Points of a search for ports, and for moves of a port.
+SEARCH_POINTS, MOVE_POINTS = 48, 96
 REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
+FOUND_NAME, PLACEMENTS_NAME = "ports.toml", "placements.csv"
 # All possible files of a study; the pictures depend on the arms and OpenGL.
 RESULT_NAMES = (
-    *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, "map_reach.png"),
+    *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, FOUND_NAME, PLACEMENTS_NAME, "map_reach.png"),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
 )
 
@@ -53,8 +58,9 @@ def evaluate_arms(
     *,
     seed: int = 0,
     count: int = 500,
+    faced: Ports | None = None,
     progress: StepProgress | None = None,
-    moves: bool = False,
+    tables: Mapping[str, Capability] | None = None,
     picture: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
@@ -68,8 +74,9 @@ def evaluate_arms(
         ports: a ports file, or the result of `read_ports`; by default `default_ports`.
         seed: draws the first point of the surface.
         count: number of points of the surface.
+        faced: other ports that the points face, for a comparison.
         progress: shows the steps.
-        moves: True to try moves of the ports.
+        tables: what each arm reaches, by side, to try moves of the ports.
         picture: True for a scene and a picture of the arms in the patient; without OpenGL there is no picture,
             `progress` says why.
 
@@ -79,7 +86,7 @@ def evaluate_arms(
     progress = progress or StepProgress()
     if not isinstance(scene, Anatomy):
         scene = load_anatomy(scene if isinstance(scene, Scene) else make_scene(scene))
-    anatomy, mesh = scene, scene.mesh
+    anatomy = scene
     if ports is None:
         where = default_ports(anatomy)
     else:
@@ -89,19 +96,18 @@ def evaluate_arms(
     arms = tuple(
         load_arm(source, place.port, tip_radius=radius) for source, place in ((left, where.left), (right, where.right))
     )
-    sites = _sites(anatomy, where, count, seed)
-    organ, reaches, around = ClusteredSurface(mesh.points, mesh.boundary_triangles), [], []
+    sites = find_sites(anatomy, where, count, seed, faced)
+    obstacles, reaches, around = Obstacles.of(anatomy, where), [], []
     for side, arm in zip(SIDES, arms, strict=True):
         with progress.step(f"the {side} arm at {len(sites.points)} points"):
             kinematics = BatchKinematics(arm)
-            around.append(Obstacles(organ, where, tip_ball(kinematics)))
+            around.append(replace(obstacles, ball=tip_ball(kinematics)))
             reaches.append(evaluate_reach(kinematics, sites, around[-1]))
     with progress.step("both arms at once"):
         both = evaluate_both(reaches[0], reaches[1], sites.points)
     cycle = None
     if anatomy.scene.motions:
-        obstacles = around[0], around[1]
-        cycle = evaluate_cycle((reaches[0], reaches[1]), both, sites, obstacles, anatomy, progress)
+        cycle = evaluate_cycle((reaches[0], reaches[1]), both, sites, (around[0], around[1]), anatomy, progress)
     surface, triangles = anatomy.outer_surface
     evaluation = ArmsEvaluation(
         points=sites.points,
@@ -118,14 +124,15 @@ def evaluate_arms(
         ports=where.frames,
         cycle=cycle,
     )
-    if moves and not both.reachable[~sites.inner].all():
+    if tables is not None and not both.reachable[~sites.inner].all():
         with progress.step("moving the ports"):
-            search = PortSearch(dict(zip(SIDES, (left, right))), anatomy, organ, sites)
-            found: dict[str, Found] = dict(zip(SIDES, reaches))
-            move = search.best_move(where, found, both.reachable, camera_view(evaluation))
+            outer = np.flatnonzero(~sites.inner)
+            quick = QuickReach(anatomy, tables, obstacles, sites.only(outer[:MOVE_POINTS]))
+            move = best_move(quick, where, both.reachable[outer], camera_view(evaluation))
         evaluation = replace(evaluation, move=move, moves_tried=True)
     if picture:
-        shown = ArmsInPatient.at_middle(evaluation, arms, both, where)
+        given = None if faced == where else faced
+        shown = ArmsInPatient.at_middle(evaluation, arms, both, where, given)
         evaluation = replace(evaluation, turning=shown.scene())
         try:
             evaluation = replace(evaluation, picture=shown.picture())
@@ -134,9 +141,10 @@ def evaluate_arms(
     return evaluation
 
 
-def _sites(anatomy: Anatomy, ports: Ports, count: int, seed: int) -> Sites:
-    """Points of the surface, then the inner targets with normals to the endoscope."""
-    trocars = np.array([ports.left.point, ports.right.point])
+def find_sites(anatomy: Anatomy, ports: Ports, count: int, seed: int, faced: Ports | None = None) -> Sites:
+    """Points of the surface that face the ports, or others, then the inner targets with normals to the endoscope."""
+    towards = faced or ports
+    trocars = np.array([towards.left.point, towards.right.point])
     points, normals = facing_points(anatomy, trocars, count, seed)
     inner: FloatArray = np.array([target.point for target in ports.targets], dtype=np.float64).reshape(-1, 3)
     out = np.array(ports.endoscope.point) - inner
@@ -168,20 +176,12 @@ def facing_points(anatomy: Anatomy, ports: ArrayLike, count: int, seed: int) -> 
         raise ValueError("no free part of the organ's surface faces the ports: move the ports")
     corners, normals = corners[facing], normals[facing]
     while len(corners) < PLACES_PER_POINT * count:
-        corners, normals = _quartered(corners), np.repeat(normals, 4, axis=0)
+        corners, normals = quartered(corners), np.repeat(normals, 4, axis=0)
     centres = corners.mean(axis=1)
     # Ranked by distance from the ports: a mirrored organ has mirrored points, in the same order.
     ranked = np.argsort(np.linalg.norm(centres - middle, axis=1), kind="stable")
     chosen = _spread(centres, count, int(ranked[np.random.default_rng(seed).integers(len(centres))]))
     return centres[chosen], normals[chosen]
-
-
-def _quartered(corners: FloatArray) -> FloatArray:
-    """Each triangle (n, 3, 3) cut into four congruent ones."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
-    parts = [np.stack(three, axis=1) for three in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    return np.stack(parts, axis=1).reshape(-1, 3, 3)
 
 
 def _spread(points: FloatArray, count: int, first: int) -> np.ndarray:
@@ -220,23 +220,31 @@ def run_study(
     points: int,
     seed: int,
     command: str,
+    search_seconds: float | None = None,
 ) -> list[str]:
     """Evaluate the setups, rank them if there are several, and write report, points, heat maps and picture.
 
     Args:
-        setups: the reported one, then those of the comparison.
+        setups: the reported one, then those of the comparison. The points of all face the ports of the first.
         anatomy: of the organ.
         folder: for the files.
         console: for progress and results.
         points: number of points of the organ.
         seed: of the points.
         command: the command line, for the report.
+        search_seconds: time for a search of better ports, which are reported in place of the first setup's.
 
     Returns:
         The names of the files.
     """
-    evaluations = []
+    evaluations, given, found = [], setups[0], None
     with StepProgress(console) as progress:
+        with progress.step("tables of what each arm reaches"):
+            tables = _tables(given, anatomy.scene.instrument.tip_radius)
+        if search_seconds is not None:
+            found = _search(given, anatomy, tables, search_seconds, seed, progress)
+            what = f"ports found, {given.left.name} left, {given.right.name} right"
+            setups = [replace(given, name=FOUND_NAME, what=what, ports=found.best.ports), *setups]
         for setup in setups:
             progress.say(f"{setup.name}: {setup.what}")
             evaluations.append(
@@ -247,12 +255,13 @@ def run_study(
                     setup.ports,
                     seed=seed,
                     count=points,
+                    faced=given.ports,
                     progress=progress,
-                    moves=setup is setups[0],
+                    tables=tables if setup is setups[0] else None,
                     picture=setup is setups[0],
                 )
             )
-        first = evaluations[0]
+        first = replace(evaluations[0], search=found)
         maps = ArmMaps(first).write_all(folder, progress)
     ranking = (
         rank([(setup.name, setup.what, each) for setup, each in zip(setups, evaluations, strict=True)])
@@ -263,4 +272,30 @@ def run_study(
     pictures = [] if first.picture is None else [write_picture(first.picture, folder / PICTURE_NAME)]
     write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
     console.print(verdict(first), highlight=False)
-    return [REPORT_NAME, POINTS_NAME, *(drawing.name for drawing in (*pictures, *maps))]
+    names = [REPORT_NAME, POINTS_NAME, *(drawing.name for drawing in (*pictures, *maps))]
+    if found is not None:
+        write_placements(found, folder / PLACEMENTS_NAME)
+        (folder / FOUND_NAME).write_text(as_toml(found.best.ports), encoding="utf-8", newline="\n")
+        names += [FOUND_NAME, PLACEMENTS_NAME]
+    return names
+
+
+def _tables(setup: ArmSetup, tip_radius: float) -> dict[str, Capability]:
+    """Tables of both arms; of equal arms one."""
+    left = Capability(setup.left, tip_radius)
+    return {"left": left, "right": left if setup.right == setup.left else Capability(setup.right, tip_radius)}
+
+
+def _search(
+    setup: ArmSetup,
+    anatomy: Anatomy,
+    tables: Mapping[str, Capability],
+    seconds: float,
+    seed: int,
+    progress: StepProgress,
+) -> PortsFound:
+    """Search for better ports of a setup."""
+    sites = find_sites(anatomy, setup.ports, SEARCH_POINTS, seed)
+    ports = on_one_wall(setup.ports)
+    quick = QuickReach(anatomy, tables, Obstacles.of(anatomy, ports), sites)
+    return PortSearch(anatomy, quick, ports).run(seconds, seed, progress)

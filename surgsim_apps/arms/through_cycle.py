@@ -5,7 +5,7 @@ body wall and endoscope stay.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,6 +70,26 @@ def make_cycle(motions: Sequence[CyclicMotion]) -> Cycle:
     return Cycle(tuple(motions), main, level, tuple(before))
 
 
+def extreme_signals(motions: Sequence[CyclicMotion]) -> FloatArray:
+    """Signals at rest, at the top of the largest motion, and at the tops of all, (n_position, n_motion)."""
+    if not motions:
+        return np.zeros((1, 0))
+    signals = make_cycle(motions).signals
+    return signals[[0, STEPS, -1]] if len(motions) > 1 else signals[[0, STEPS]]
+
+
+def moved_organ(anatomy: Anatomy, sites: Sites, signals: FloatArray) -> Iterator[tuple[Sites, FloatArray]]:
+    """Points of the organ and nodes (n_node, 3) [m] at each position, by signals (n_position, n_motion)."""
+    nodes = anatomy.mesh.points
+    shifts = [(motion.shift(sites.points), motion.shift(nodes)) for motion in anatomy.ground_motions]
+    for signal in signals:
+        moved = [rest.copy() for rest in (sites.points, nodes)]
+        for share, parts in zip(signal, shifts, strict=True):
+            for points, shift in zip(moved, parts, strict=True):
+                points += share * shift
+        yield replace(sites, points=moved[0]), moved[1]
+
+
 def evaluate_cycle(
     arms: tuple[Reach, Reach],
     both: BothArms,
@@ -89,17 +109,13 @@ def evaluate_cycle(
         progress: shows the steps.
     """
     cycle, mesh = make_cycle(anatomy.scene.motions), anatomy.mesh
-    shifts, nodes = (
-        np.stack([motion.shift(rest) for motion in anatomy.ground_motions]) for rest in (sites.points, mesh.points)
-    )
+    nodes = [motion.shift(mesh.points) for motion in anatomy.ground_motions]
     count = len(cycle.signals)
     places, organs = [sites], [around[0].organ]
     reachable, together = [[arm.report.reachable] for arm in arms], [both]
     with progress.step("both arms through the cycle", 2 * count) as advance:
-        for number in range(1, count):
-            signal = cycle.signals[number]
-            places.append(replace(sites, points=sites.points + np.einsum("m,mni->ni", signal, shifts)))
-            moved_nodes = mesh.points + np.einsum("m,mni->ni", signal, nodes)
+        for place, moved_nodes in moved_organ(anatomy, sites, cycle.signals[1:]):
+            places.append(place)
             organs.append(ClusteredSurface(moved_nodes, mesh.boundary_triangles))
             reaches = []
             for arm, obstacles, rows in zip(arms, around, reachable, strict=True):
@@ -182,7 +198,8 @@ def _next(
     candidates = search_joints(kinematics, Wanted(sites.tips(around.ball)[rows]), joints)
     chain = kinematics.at(candidates.joints)
     clear = sites.inner[rows] | around.clears_organ(kinematics, chain)
-    return candidates.joints, candidates.met & clear & (around.wall_clearance(kinematics, chain) >= 0.0)
+    clear &= (around.wall_clearance(kinematics, chain) >= 0.0) & around.clears_others(kinematics, chain.shape_ends)
+    return candidates.joints, candidates.met & clear
 
 
 def _together(

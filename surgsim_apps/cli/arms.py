@@ -49,6 +49,8 @@ class Arms:
     """Number of points of the organ."""
     seed: int = 0
     """Seed of the points."""
+    search: Annotated[int | None, shown_as("SECONDS")] = None
+    """Search for better ports on the body wall for at most so long, and report them beside the given ones."""
     motion: MaybeText = None
     """Breathing of the patient: none, calm or free; default: the scene's. Adds reach, paths and clearance through the
     cycle to the report."""
@@ -64,6 +66,8 @@ class Arms:
             words += ["--ports", shown_path(self.ports)]
         if self.compare:
             words += ["--compare", *map(shown_path, self.compare)]
+        if self.search is not None:
+            words += ["--search", str(self.search)]
         counts = ["--points", self.points, "--seed", self.seed]
         if self.motion is not None:
             counts += ["--motion", self.motion]
@@ -75,16 +79,24 @@ class Arms:
         Raises:
             ValueError: an impossible option, in one line.
         """
-        for name, least in (("points", FEWEST_POINTS), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"--{name} is {getattr(self, name)}; it must be a whole number of at least {least}")
+        for name, least in (("points", FEWEST_POINTS), ("seed", 0), ("search", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"--{name} is {value}; it must be a whole number of at least {least}")
         if self.points > MOST_POINTS:
             raise ValueError(f"--points is {self.points}; it must be at most {MOST_POINTS}")
         anatomy = load_anatomy(with_motion(make_scene(self.scene), self.motion))
         setups = [_setup(self, anatomy, compared) for compared in (None, *self.compare)]
         with output_folder(self.out, RESULT_NAMES) as files:
             written = run_study(
-                setups, anatomy, files, console, points=self.points, seed=self.seed, command=self.command_line
+                setups,
+                anatomy,
+                files,
+                console,
+                points=self.points,
+                seed=self.seed,
+                command=self.command_line,
+                search_seconds=self.search,
             )
         console.print(f"written: {files.path}/{{{','.join(written)}}}", highlight=False, soft_wrap=True)
         return 0

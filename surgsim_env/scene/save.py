@@ -1,4 +1,4 @@
-"""Scenes and arms written as TOML from the dataclasses' fields, so none can be left out."""
+"""Scenes, arms and ports written as TOML from the dataclasses' fields, so none can be left out."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,8 +8,7 @@ from typing import Any
 import tomlkit
 from tomlkit.items import AbstractTable, Item, Table
 
-from surgsim_env.scene.arm_description import ArmDescription
-from surgsim_env.scene.model import Ball, Box, Scene, Side
+from surgsim_env.scene.model import Ball, Box, Side
 
 # Fields from the file's own path, not written.
 PATH_FIELDS = ("name", "folder")
@@ -19,10 +18,8 @@ INLINE_TABLES = (Box, Ball, Side)
 COMMENT_COLUMN = 23
 
 
-def as_toml(
-    values: Scene | ArmDescription, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
-) -> str:
-    """TOML of a scene or an arm's description; `scene_from_table` or `read_description` reads an equal one.
+def as_toml(values: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None) -> str:
+    """TOML of a frozen dataclass, as of a scene, an arm's description or ports, from which `fill` makes an equal one.
 
     Args:
         values: to be written.

@@ -240,7 +240,7 @@ def run_study(
     evaluations, given, found = [], setups[0], None
     with StepProgress(console) as progress:
         with progress.step("tables of what each arm reaches"):
-            tables = _tables(given, anatomy.scene.instrument.tip_radius)
+            tables = make_tables(given, anatomy.scene.instrument.tip_radius)
         if search_seconds is not None:
             found = _search(given, anatomy, tables, search_seconds, seed, progress)
             what = f"ports found, {given.left.name} left, {given.right.name} right"
@@ -280,7 +280,7 @@ def run_study(
     return names
 
 
-def _tables(setup: ArmSetup, tip_radius: float) -> dict[str, Capability]:
+def make_tables(setup: ArmSetup, tip_radius: float) -> dict[str, Capability]:
     """Tables of both arms; of equal arms one."""
     left = Capability(setup.left, tip_radius)
     return {"left": left, "right": left if setup.right == setup.left else Capability(setup.right, tip_radius)}

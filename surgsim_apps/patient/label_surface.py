@@ -22,5 +22,6 @@ def read_label_surface(file: Path, label: str) -> tuple[FloatArray, IntArray]:
     image = read_label_image(file, [LabelName("surface", int(label) if label.isdigit() else label)])
     field = smoothed_share(image.tags > 0, np.zeros(3, dtype=np.int64), image.geometry.spacing, CELL_SIZE)
     volume = np.count_nonzero(image.tags) * image.voxel_volume
-    points, triangles = level_surface(field, volume, 6.0 * volume ** (2.0 / 3.0), TRIANGLES_MOST)
+    a, b, c = (np.array(image.tags.shape) * image.geometry.spacing).tolist()
+    points, triangles = level_surface(field, volume, 2.0 * (a * b + b * c + c * a), TRIANGLES_MOST)
     return image.geometry.places(points), triangles.astype(np.int32)

@@ -1,15 +1,18 @@
 """`surgsim arms` as a user meets it: files that repeat to the byte, a table of placements, one line for bad input."""
 
+import csv
 import shutil
 
 import pytest
 
 from surgsim_apps.arms import study
-from surgsim_apps.arms.ports import default_ports
+from surgsim_apps.arms.ports import default_ports, read_ports
+from surgsim_apps.arms.study import make_tables
 from surgsim_apps.cli.main import main
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, scenes_folder
 from tests.arms.made import made_evaluation
+from tests.arms.pivot_arm import write_pivot
 
 INSTRUMENTS = scenes_folder() / "instruments"
 PORTS = """
@@ -42,12 +45,13 @@ def made(monkeypatch):
     """In place of the evaluation, made-up ones: wider ports reach more, another arm less. Lists what was asked for."""
     asked = []
 
-    def evaluate(anatomy, left, right, ports, *, seed, count, progress, picture, moves):
+    def evaluate(anatomy, left, right, ports, *, seed, count, faced, progress, picture, tables):
         asked.append((left, right, ports))
         reach = 0.6 if ports.left.point[0] < -0.05 else 0.1 if left.name == "six_axis" else 0.3
         return made_evaluation(count=count, seed=seed, left_to=reach, right_to=reach)
 
     monkeypatch.setattr(study, "evaluate_arms", evaluate)
+    monkeypatch.setattr(study, "make_tables", lambda *_: {})
     return asked
 
 
@@ -56,6 +60,23 @@ def arguments(*more, left="psm_grasper", right="psm_palpator", ports="ports.toml
         *("arms", "--scene", "phantom", "--left", left, "--right", right, "--ports", ports),
         *("--points", "40", "--out", str(out), *more),
     ]
+
+
+def test_a_search_writes_the_ports_found_and_ranks_them_with_the_given(folder, made, monkeypatch, capsys):
+    monkeypatch.setattr(study, "make_tables", make_tables)
+    arm = str(write_pivot(folder))
+    assert main(arguments("--search", "2", left=arm, right=arm)) == 0
+    found, given = (read_ports(path) for path in (folder / "out" / "ports.toml", folder / "ports.toml"))
+    assert [ports for *_, ports in made] == [found, given]
+    assert found != given and found.endoscope.target == given.endoscope.target
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert "placements were tried" in page and "ports found" in page
+    header, best, *front = csv.reader((folder / "out" / "placements.csv").open())
+    assert [float(best[header.index(f"left_{axis}_m")]) for axis in "xyz"] == pytest.approx(list(found.left.point))
+    assert front
+    assert "--search 2" in page
+    assert main(arguments("--search", "0")) == 2
+    assert "--search is 0" in capsys.readouterr().err
 
 
 def test_the_files(folder, made, capsys):

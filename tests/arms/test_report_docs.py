@@ -33,7 +33,7 @@ def test_every_reason_is_explained():
 
 
 def test_the_ports_file_is_read_and_is_where_ports_are_by_default():
-    (text,) = re.findall(r"```toml\n(.*?)```", DOCS, flags=re.S)
+    text = re.findall(r"```toml\n(.*?)```", DOCS, flags=re.S)[0]
     ports = ports_from_table(tomllib.loads(text), name="ports")
     anatomy = load_anatomy(make_scene("liver"))
     ports.check_outside(anatomy)
@@ -48,7 +48,7 @@ def test_the_ports_file_is_read_and_is_where_ports_are_by_default():
 @pytest.mark.usefixtures("few_maps")
 def test_the_command_runs_and_writes_what_the_table_lists(tmp_path, monkeypatch):
     (command,) = set(re.findall(r"^surgsim (arms .*--compare.*)$", DOCS + README, flags=re.M))
-    (text,) = re.findall(r"```toml\n(.*?)```", DOCS, flags=re.S)
+    text = re.findall(r"```toml\n(.*?)```", DOCS, flags=re.S)[0]
     monkeypatch.chdir(tmp_path)
     for name in ("ports.toml", "wide.toml"):
         Path(name).write_text(text)

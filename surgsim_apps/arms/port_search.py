@@ -45,11 +45,16 @@ SCOPE_DIRECTIONS, SCOPE_APART = 15, 0.005
 
 
 class PortSearch:
-    """Placements of ports on a body wall, by directions from the endoscope's target."""
+    """Placements of ports on a body wall, by directions from the endoscope's target.
+
+    Fields:
+        ports: to begin with
+        quick: reach of the arms
+    """
 
     def __init__(self, anatomy: Anatomy, quick: QuickReach, ports: Ports) -> None:
         """Take a scene, the reach of its arms, and ports to begin with, which define wall and target."""
-        self._quick, self._organ = quick, anatomy.mesh.points
+        self.quick, self._organ = quick, anatomy.mesh.points
         self.ports = on_one_wall(ports)
         self._skin = None if ports.wall.skin is None else ports.wall.skin.read()
         line = np.array(ports.right.point) - np.array(ports.left.point)
@@ -66,10 +71,10 @@ class PortSearch:
         end = time.monotonic() + seconds
 
         def losses(columns: FloatArray) -> FloatArray:
-            placed = {row: ports for row, values in enumerate(columns.T) if (ports := self._placed(values)) is not None}
+            placed = {row: ports for row, values in enumerate(columns.T) if (ports := self.placed(values)) is not None}
             result = np.ones(columns.shape[1])
             if placed:
-                figures = self._quick.evaluate([*placed.values()])
+                figures = self.quick.evaluate([*placed.values()])
                 result[[*placed]] = -_worth(figures)
                 tried.extend(_placements([*placed.values()], figures))
                 worths.extend(_worth(figures).tolist())
@@ -91,10 +96,10 @@ class PortSearch:
                 losses, BOUNDS * 2, init=begin, vectorized=True, updating="deferred", tol=0.0, maxiter=10**6,
                 polish=False, callback=over, rng=seed,
             )  # fmt: skip
-        (given,) = _placements([self.ports], self._quick.evaluate([self.ports]))
+        (given,) = _placements([self.ports], self.quick.evaluate([self.ports]))
         best = tried[int(np.argmax(worths))]
         swapped = [replace(self.ports, **{side: getattr(best.ports, side)}) for side in SIDES]
-        gains: dict[str, float] = dict(zip(SIDES, self._quick.evaluate(swapped).share.tolist(), strict=True))
+        gains: dict[str, float] = dict(zip(SIDES, self.quick.evaluate(swapped).share.tolist(), strict=True))
         seen = replace(best, ports=replace(best.ports, endoscope=self._endoscope(best.ports)))
         return PortsFound(given, seen, _front([given, *tried]), gains, len(tried))
 
@@ -112,7 +117,7 @@ class PortSearch:
             chosen, reached = [*kept], []
             for first in range(0, len(chosen), ALONE_AT_ONCE):
                 reached.append(
-                    self._quick.alone(side, [kept[row].port for row in chosen[first : first + ALONE_AT_ONCE]])
+                    self.quick.alone(side, [kept[row].port for row in chosen[first : first + ALONE_AT_ONCE]])
                 )
                 if time.monotonic() > end - (1 - number) * 0.5 * seconds:
                     break
@@ -152,7 +157,7 @@ class PortSearch:
             values += [*np.arctan2(self._aside @ away, max(float(away @ self._out), 1e-9)), place.roll]
         return np.array(values)
 
-    def _placed(self, values: FloatArray) -> Ports | None:
+    def placed(self, values: FloatArray) -> Ports | None:
         """Ports of the search's numbers; None where they miss the wall or come too near to each other or the organ."""
         left, right = map(self._place, values.reshape(2, 3))
         if left is None or right is None or not self._apart(np.array(left.point), np.array(right.point)):
@@ -196,7 +201,7 @@ class PortSearch:
                 if point is None or min(math.dist(point, getattr(ports, side).point) for side in SIDES) < PORTS_APART:
                     continue
                 # Shares in twentieths: the middle counts where they are alike.
-                key = round(20.0 * self._quick.seen_from(point)) / 20.0, -math.dist(point, middle)
+                key = round(20.0 * self.quick.seen_from(point)) / 20.0, -math.dist(point, middle)
                 if key > best:
                     best, chosen = key, EndoscopePort(vector(point), vector(self._target))
         return chosen

@@ -221,10 +221,10 @@ class SlideSweep:
 
     def declare(self, memory: SlideMemory) -> FloatArray:
         """The declared map as numbers of an action."""
-        points = self.estimate(memory).points
+        points = self.estimated_lesions(memory).points
         return lesion_numbers(points, np.full(len(points), LESION_RADIUS), memory.map.extent)
 
-    def estimate(self, memory: SlideMemory) -> LesionEstimate:
+    def estimated_lesions(self, memory: SlideMemory) -> LesionEstimate:
         """Lesions by the Gaussian process, lengths in tip radii."""
         estimator = LesionEstimator(
             memory.map.extent,

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from surgsim_apps.scoring.episodes import episode_facts
+from surgsim_apps.scoring.episodes import check_agent, episode_facts, estimates_itself
 from surgsim_apps.training.slide_agents import (
     SLIDES,
     SlideMemory,
@@ -81,6 +81,13 @@ def played(name, seed, **settings):
         observation, _, terminated, truncated, info = env.step(agent.act(observation))
         over = terminated or truncated
     return info["map_score"], env
+
+
+@pytest.mark.parametrize("name", SLIDES)
+def test_a_subclass_of_each_agent_may_be_submitted(name):
+    agent = type("Mine", (SLIDES[name],), {})()
+    check_agent(agent, "it")
+    assert not estimates_itself(agent)
 
 
 @pytest.mark.parametrize("name", SLIDES)

@@ -452,6 +452,8 @@ class SurgicalEnv(gym.Env[Observation, Action]):
 
     def _info(self, fault: str, saturated: bool, task_info: Info, rewards: dict[str, float]) -> Info:
         residual = self.simulation.instrument.trocar_residual
+        force = self.simulation.instrument.trocar_force
+        wall = {} if force is None else {"trocar_force": force}
         member = {} if self.runtime.family is None else {"member": str(self.task.anatomy.member)}
         return {
             "sim_fault": fault,
@@ -459,6 +461,7 @@ class SurgicalEnv(gym.Env[Observation, Action]):
             "workspace_limited": self.simulation.instrument.workspace_limited,
             "added_mass": self.simulation.organ_model.added_mass,
             "trocar_error_mm": -1.0 if residual is None else residual * 1000.0,
+            **wall,
             **member,
             **task_info,
             **{f"reward_{name}": value for name, value in rewards.items()},

@@ -213,6 +213,11 @@ class Instrument(ToolBodies):
         return bool(self.servo.limited[: len(self.servo.limited) - 2 * len(self.jaws)].any())
 
     @property
+    def trocar_force(self) -> float | None:
+        """Size of the shaft's force on a yielding wall [N]; None without one."""
+        return None
+
+    @property
     def trocar_residual(self) -> float | None:
         """Distance of the shaft's axis from the trocar [m]; None for an instrument without one."""
         return None

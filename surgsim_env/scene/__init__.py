@@ -58,6 +58,7 @@ from surgsim_env.scene.model import (
     TetFile,
     TissueRegion,
     Vector,
+    YieldingWall,
     require_number,
     substeps_needed,
 )
@@ -111,6 +112,7 @@ __all__ = [
     "TissueRegion",
     "Trocar",
     "Vector",
+    "YieldingWall",
     "agents_folder",
     "anatomy_of",
     "as_toml",

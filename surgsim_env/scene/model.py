@@ -311,6 +311,31 @@ class SceneInstrument:
 
 
 @dataclass(frozen=True)
+class YieldingWall:
+    """Body wall that holds a trocar by springs and dampers, and lets the shaft slide with friction; values chosen.
+
+    Args:
+        stiffness_across: across the port's axis [N/m].
+        stiffness_along: along it [N/m].
+        damping: in each direction [N s/m].
+        friction: of the shaft in the trocar [N].
+        mass: of wall and trocar that move [kg].
+    """
+
+    stiffness_across: float = 1000.0
+    stiffness_along: float = 500.0
+    damping: float = 10.0
+    friction: float = 0.5
+    mass: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name, unit in (("stiffness_across", "N/m"), ("stiffness_along", "N/m"), ("mass", "kg")):
+            require_number(f"wall.{name}", getattr(self, name), 0.0, unit, above=True)
+        for name, unit in (("damping", "N s/m"), ("friction", "N")):
+            require_number(f"wall.{name}", getattr(self, name), 0.0, unit)
+
+
+@dataclass(frozen=True)
 class Port:
     """Frame of a port: its origin is the trocar, its -z points into the body.
 
@@ -318,11 +343,13 @@ class Port:
         point: the trocar [m], world frame.
         into: direction into the body, any length.
         roll: rotation of the frame about its z axis [rad]; at 0, x is as close to world x (else y) as possible.
+        wall: that yields to the shaft; by default the trocar is a point that bears no force.
     """
 
     point: Vector = (0.0, 0.0, 0.0)
     into: Vector = (0.0, 0.0, -1.0)
     roll: float = 0.0
+    wall: YieldingWall | None = None
 
     def __post_init__(self) -> None:
         if not np.isfinite([*self.point, *self.into, self.roll]).all() or not math.hypot(*self.into) > 0.0:

@@ -115,6 +115,13 @@ class Arm:
         start, along = data.xpos[self.shaft] + matmul(rotation, self.shaft_point), matmul(rotation, self.shaft_axis)
         return start + matmul(self.trocar - start, along) * along, along
 
+    def trocar_place(self, joints: ArrayLike) -> float:
+        """Place of the trocar on the shaft's axis, from the shaft's point on [m]."""
+        near = self.shaft_line(joints)[0]
+        rotation = self._data.xmat[self.shaft].reshape(3, 3)
+        start = self._data.xpos[self.shaft] + matmul(rotation, self.shaft_point)
+        return float(matmul(near - start, matmul(rotation, self.shaft_axis)))
+
     def trocar_residual(self, joints: ArrayLike) -> float:
         """Distance of the shaft's axis from the trocar at joint values (n,) [m]."""
         return float(norm(self.trocar - self.shaft_line(joints)[0]))

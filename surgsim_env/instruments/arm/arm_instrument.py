@@ -46,6 +46,12 @@ class SteeredArms(Instrument):
         """Distance of the shaft's axis from the trocar at the current joint values [m], the larger of two arms'."""
         return max(arm.trocar_residual for arm in self.arms.values())
 
+    @property
+    def trocar_force(self) -> float | None:
+        """Size of the shaft's force on a yielding wall [N], the larger of two arms'; None for rigid walls."""
+        forces = [norm(arm.trocar_force) for arm in self.arms.values() if arm.trocar_force is not None]
+        return float(max(forces)) if forces else None
+
     def get_state(self) -> FloatArray:
         """Whole state of the instrument, with commands and commanded directions, as a vector."""
         return np.concatenate([super().get_state(), *(arm.get_state() for arm in self.arms.values())])

@@ -17,13 +17,15 @@ from msdm_core.organ.support import Support
 from surgsim_env.instruments.arm.urdf import check_numbers, import_mesh, prepare_urdf
 from surgsim_env.instruments.joint_couplings import Followers, followers_of, narrowed_limits
 from surgsim_env.instruments.tool_bodies import CONTACT_GROUP, add_supports
-from surgsim_env.scene.arm_description import ArmDescription, LinkInertia
+from surgsim_env.scene.arm_description import ArmDescription, LinkInertia, Trocar
 from surgsim_env.scene.load import nearest
-from surgsim_env.scene.model import Port, frame_into
+from surgsim_env.scene.model import Port, YieldingWall, frame_into
 
 # Groups of geoms: visual only, and outer links for clearances; geoms of CONTACT_GROUP touch tissue.
 VISUAL_GROUP, LINK_GROUP = 1, 2
 TIP_SITE = "surgsim_tip"
+# A yielding wall, its joints (the last along the port's axis), and what slides on the shaft, with its mass [kg].
+WALL, WALL_JOINTS, CANNULA, CANNULA_MASS = "wall", ("wall_x", "wall_y", "wall_z"), "cannula", 0.01
 # Couplings of joints are as rigid as MuJoCo can make them: within two steps, and by all but 1e-4 of their force.
 COUPLING_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 # Joints of a URDF that may follow others and be followed.
@@ -71,6 +73,8 @@ def arm_spec(description: ArmDescription, port: Port, tip_radius: float | None, 
     _check_parts(spec, description)
     hold_joints(spec, description.held)
     _set_up(spec, description, port, tip_radius, timestep)
+    if port.wall is not None:
+        _add_wall(spec, description.trocar, port, port.wall)
     return spec
 
 
@@ -339,6 +343,36 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
     frame = world.add_frame(pos=np.array(port.point) - matmul(rotation, np.array(trocar.point)), quat=quaternion)
     for part in rooted:
         part.set_frame(frame)
+
+
+def _add_wall(spec: mujoco.MjSpec, trocar: Trocar, port: Port, wall: YieldingWall) -> None:
+    """Add a wall on three springs at the port, joined at one point to a cannula that slides on the shaft."""
+    most = wall.mass / spec.option.timestep**2
+    if max(wall.stiffness_across, wall.stiffness_along) > most:
+        raise ValueError(
+            f"wall: stiffness {wall.stiffness_across:g} and {wall.stiffness_along:g} N/m; the rule is at most mass / "
+            f"step^2 = {most:g} N/m for a stable step: lower it, or raise wall.mass"
+        )
+    body = spec.worldbody.add_body(name=WALL, pos=port.point, mass=wall.mass, inertia=[1e-6] * 3, gravcomp=1.0)
+    mujoco.mju_mat2Quat(body.quat, port.rotation.ravel())
+    slide = mujoco.mjtJoint.mjJNT_SLIDE
+    for name, axis in zip(WALL_JOINTS, np.eye(3), strict=True):
+        along = name == WALL_JOINTS[-1]
+        joint = body.add_joint(name=name, type=slide, axis=axis)
+        joint.stiffness[0] = wall.stiffness_along if along else wall.stiffness_across
+        joint.damping[0] = wall.damping
+    cannula = spec.body(trocar.shaft_body).add_body(
+        name=CANNULA, pos=trocar.shaft_point, mass=CANNULA_MASS, inertia=[1e-7] * 3, gravcomp=1.0
+    )
+    joint = cannula.add_joint(name=CANNULA, type=slide, axis=trocar.shaft_axis, frictionloss=wall.friction)
+    # By default MuJoCo's friction creeps under half its load.
+    joint.solref_friction, joint.solimp_friction = rigid = (2.0 * spec.option.timestep, 1.0), COUPLING_SOLIMP
+    for part in (body, cannula):
+        part.add_site(name=f"{part.name}_point")
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=f"{WALL}_point",
+        name2=f"{CANNULA}_point", solref=rigid[0], solimp=rigid[1],
+    )  # fmt: skip
 
 
 def _narrow_limits(model: mujoco.MjModel, arm: ArmDescription) -> None:

@@ -17,6 +17,7 @@ from surgsim_env.instruments.arm.inverse_kinematics import (
     turn_matrix,
     turn_towards,
 )
+from surgsim_env.instruments.arm.model import CANNULA, WALL_JOINTS
 from surgsim_env.instruments.instrument import Instrument, Jaw
 from surgsim_env.instruments.tool_bodies import frame_along
 
@@ -75,6 +76,9 @@ class SteeredArm:
         instrument.servo.lower[places], instrument.servo.upper[places] = arm.lower, arm.upper
         self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
         self._velocity = np.zeros(6)
+        wall = arm.port.wall
+        self._wall = None if wall is None else [model.joint(prefix + name).id for name in WALL_JOINTS]
+        self._cannula = None if wall is None else int(model.joint(prefix + CANNULA).qposadr[0])
         self._starts = [direction / norm(direction)]
         if jaw is not None and jaw.has_pads:
             # Either pad may be the upper one.
@@ -112,6 +116,16 @@ class SteeredArm:
         return self.arm.trocar_residual(self.joint_positions)
 
     @property
+    def trocar_force(self) -> FloatArray | None:
+        """Force of the wall's springs and dampers, as the shaft presses on the wall [N] (3,); None for a rigid wall."""
+        if self._wall is None:
+            return None
+        model, data = self._instrument.model, self._instrument.data
+        stiffness, damping = model.jnt_stiffness[self._wall], model.dof_damping[model.jnt_dofadr[self._wall]]
+        stretch, speed = data.qpos[model.jnt_qposadr[self._wall]], data.qvel[model.jnt_dofadr[self._wall]]
+        return matmul(self.arm.port.rotation, stiffness * stretch + damping * speed)
+
+    @property
     def limited(self) -> bool:
         """True if the box, a joint's limit or its speed limit stopped the commanded motion of the tip."""
         return self.short or bool(self._instrument.servo.limited[self._places].any())
@@ -137,6 +151,8 @@ class SteeredArm:
         data.qpos[self._qpos] = np.append(solution.joints, self.arm.followers.values(solution.joints))
         data.ctrl[servo.position[self._places]] = solution.joints
         servo.command[self._places] = 0.0
+        if self._cannula is not None:
+            data.qpos[self._cannula] = self.arm.trocar_place(solution.joints)
         if self.jaw is not None:
             self.jaw.rest()
 

@@ -347,7 +347,7 @@ def _place(spec: mujoco.MjSpec, arm: ArmDescription, port: Port) -> None:
 
 def _add_wall(spec: mujoco.MjSpec, trocar: Trocar, port: Port, wall: YieldingWall) -> None:
     """Add a wall on three springs at the port, joined at one point to a cannula that slides on the shaft."""
-    most = wall.mass / spec.option.timestep**2
+    most = wall.mass / (spec.option.timestep * spec.option.timestep)
     if max(wall.stiffness_across, wall.stiffness_along) > most:
         raise ValueError(
             f"wall: stiffness {wall.stiffness_across:g} and {wall.stiffness_along:g} N/m; the rule is at most mass / "

@@ -81,6 +81,7 @@ def turning_scene(
 ) -> TurningScene:
     """A scene of parts, first seen in a view, about the middle of the box around them."""
     import trimesh
+    from trimesh.scene import Camera
     from trimesh.viewer import scene_to_html
 
     # Points of no triangle would count for the middle.
@@ -98,6 +99,8 @@ def turning_scene(
     # The nearest place from which all points are in the picture.
     x, y, z = np.abs(seen - middle)[:, 0] / ASPECT, np.abs(seen - middle)[:, 1], (seen - middle)[:, 2]
     distance = float((np.maximum(x, y) / math.tan(math.radians(0.48 * FOV_DEG)) + z).max())
+    # A camera without a name would have a random one, and the report other bytes each time.
+    scene.camera = Camera("camera", fov=(ASPECT * FOV_DEG, FOV_DEG))
     scene.set_camera((0.0, 0.0, 0.0), distance, np.zeros(3), fov=(ASPECT * FOV_DEG, FOV_DEG))
     return TurningScene(description, scene_to_html(scene), tuple(legend))
 

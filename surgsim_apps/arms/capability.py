@@ -17,7 +17,7 @@ from surgsim_env.instruments import load_arm
 from surgsim_env.scene import ArmDescription, Port
 
 # Grid of the tip's places: spacing, least and greatest distance from the trocar [m], least cosine from the port's axis.
-SPACING, NEAREST, FURTHEST, CONE = 0.04, 0.03, 0.30, 0.3
+SPACING, NEAREST, FURTHEST, CONE = 0.06, 0.03, 0.30, 0.3
 # Ways to each place that are kept.
 WAYS = 12
 # Spacing of the organ's distances [m], and number of spacings within which they are exact.

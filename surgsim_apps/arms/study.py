@@ -40,7 +40,7 @@ from surgsim_env.step_progress import StepProgress
 # Candidates for each point.
 PLACES_PER_POINT = 12
 # Points of a search for ports, and for moves of a port.
-SEARCH_POINTS, MOVE_POINTS = 48, 96
+SEARCH_POINTS = 48
 REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
 FOUND_NAME, PLACEMENTS_NAME = "ports.toml", "placements.csv"
 # All possible files of a study; the pictures depend on the arms and OpenGL.
@@ -127,7 +127,7 @@ def evaluate_arms(
     if tables is not None and not both.reachable[~sites.inner].all():
         with progress.step("moving the ports"):
             outer = np.flatnonzero(~sites.inner)
-            quick = QuickReach(anatomy, tables, obstacles, sites.only(outer[:MOVE_POINTS]))
+            quick = QuickReach(anatomy, tables, obstacles, sites.only(outer[:SEARCH_POINTS]))
             move = best_move(quick, where, both.reachable[outer], camera_view(evaluation))
         evaluation = replace(evaluation, move=move, moves_tried=True)
     if picture:

@@ -79,7 +79,7 @@ def _next(evaluation: ArmsEvaluation) -> str:
     move = evaluation.move
     if move is None:
         return (
-            "No move of one port by 1 or 2 cm along the body wall lets both reach 1 % more."
+            "No move of one port by 2 cm along the body wall lets both reach 1 % more."
             if evaluation.moves_tried
             else ""
         )

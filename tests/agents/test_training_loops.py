@@ -34,24 +34,25 @@ def test_each_file_has_a_test() -> None:
 
 def test_stable_baselines3_evaluates_a_success_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run("sb3.py", tmp_path, monkeypatch)
-    assert names["evaluation"]._is_success_buffer == [False] * 3
+    assert len(names["evaluation"]._is_success_buffer) == 3
     assert names["model"].ep_success_buffer
     with (tmp_path / "runs" / "sb3" / "progress.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["eval/success_rate"]) for row in rows if row["eval/success_rate"]] == [0.0, 0.0]
+    assert len([row for row in rows if row["eval/success_rate"]]) == 2
 
 
 def test_a_loop_in_one_file_reads_ends_of_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = run("ppo.py", tmp_path, monkeypatch)
-    # Eight lanes, 64 steps, episodes of 20 steps that nothing ends before.
-    assert capsys.readouterr().out.count("episodes") == 2 and names["successes"] == [False] * 16
+    # Eight lanes, in each update 32 steps, episodes of 20 steps at most: an untrained policy may declare before.
+    assert capsys.readouterr().out.count("episodes") == 2 and len(names["successes"]) >= 8
 
 
 def test_torchrl_collects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run("torchrl_ppo.py", tmp_path, monkeypatch)
-    assert names["successes"] == [False] * 24
+    # In each batch 32 steps of eight lanes, episodes of 20 steps at most.
+    assert len(names["successes"]) >= 16
 
 
 def test_torchrl_makes_one_environment_by_its_id() -> None:

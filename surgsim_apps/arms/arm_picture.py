@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from msdm_core.mesh import FloatArray
 from surgsim_env.instruments import Arm
-from surgsim_env.rendering import Camera, DrawnCapsule, draw_still, shown_geoms
+from surgsim_env.rendering import Camera, draw_arm_still, shown_geoms
 
 SIZE, FIELD_OF_VIEW = (1600, 1200), 30.0
 # Share of the picture that the arm fills.
@@ -38,8 +38,8 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     aside = aside / length if length > 1e-6 else arm.port.rotation[:, 1]
     direction: Any = aside + AHEAD * np.cross(aside, up) + ABOVE * up
     camera = filling_camera(points, direction, up, FIELD_OF_VIEW, SIZE[0] / SIZE[1], SHARE)
-    ball = DrawnCapsule(np.stack([arm.trocar, arm.trocar]), TROCAR_RADIUS, TROCAR_COLOUR)
-    return draw_still(None, [(arm.model, data)], [ball], [camera], SIZE)[0]
+    ball = np.append(arm.trocar, TROCAR_RADIUS)
+    return draw_arm_still(arm.model, data, ball, TROCAR_COLOUR, camera, SIZE)
 
 
 def filling_camera(

@@ -1,16 +1,13 @@
-"""Two arms at a point of an organ: a scene that turns, and with OpenGL a picture."""
+"""Two arms at a point of an organ: a scene that turns."""
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from msdm_core.mesh import FloatArray
-from surgsim_apps.arms.arm_picture import filling_camera
 from surgsim_apps.arms.ports import Ports
 from surgsim_apps.arms.reach import BothArms
 from surgsim_apps.arms.reach_kinds import PORT_COLOURS, REACH_KINDS, reach_kinds
@@ -19,18 +16,13 @@ from surgsim_apps.arms.wording import share_text
 from surgsim_apps.reports.surface_drawing import INK, OrthographicView
 from surgsim_apps.reports.turning_scene import SolidPart, TurningScene, capsules_part, marks_part, turning_scene
 from surgsim_env.instruments import SIDES, Arm
-from surgsim_env.rendering import DrawnCapsule, draw_still
 from surgsim_env.scene import tangent_axes
 
-SIZE = 960, 720
 ORGAN, WALL, OBSTACLE, GIVEN = "#b8584a", "#d9a68c", "#8c8c8c", "#f0e442"
-# The wall is fainter in the picture, which shows the whole dome.
-ORGAN_OPACITY, WALL_OPACITY, DOME_OPACITY, SKIN_OPACITY = 0.6, 0.3, 0.18, 0.15
+ORGAN_OPACITY, WALL_OPACITY, SKIN_OPACITY = 0.6, 0.3, 0.15
 SCOPE_RADIUS, PORT_RADIUS = 0.005, 0.008
 # Length of the drawn endoscope outside its port, and of the drawn wall beyond the ports [m].
 SCOPE_OUTSIDE, WALL_BEYOND = 0.18, 0.05
-# Field of view of the camera beside the table [degrees], and share of the arms in the picture.
-BESIDE_FOV, SHARE = 35.0, 0.85
 # Points with a mark in the scene, spread over the organ, and radius of a mark over their usual spacing.
 MARKS_MOST, MARK_SHARE = 1000, 0.18
 
@@ -67,31 +59,6 @@ class ArmsInPatient:
         row = rows[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()]
         joints = tuple(values[row] for values in both.joints)
         return cls(evaluation, arms, joints, "with both tips at one point", ports, given)
-
-    def picture(self) -> NDArray[np.uint8]:
-        """A picture (720, 960, 3) from beside the table.
-
-        Raises:
-            NoGLError: there is no OpenGL; names what is missing.
-        """
-        from matplotlib.colors import to_rgba
-
-        posed = [(arm.model, mujoco.MjData(arm.model)) for arm in self.arms]
-        for arm, joints, (model, data) in zip(self.arms, self.joints, posed, strict=True):
-            arm.write(data, joints)
-            mujoco.mj_kinematics(model, data)
-        capsules = [
-            DrawnCapsule(ends, radius, to_rgba(colour)) for _, ends, radius, colour in self._endoscope_and_ports()
-        ]
-        wall = self.ports.wall
-        if self.ports.has_dome:
-            dome = np.stack([self.ports.dome_centre] * 2)
-            capsules.append(DrawnCapsule(dome, wall.radius, to_rgba(WALL, DOME_OPACITY)))
-        away, up = self._view()
-        seen = np.concatenate([*(ends.reshape(-1, 3) for ends in self._shape_ends()), self.evaluation.surface_points])
-        camera = filling_camera(seen, away, up, BESIDE_FOV, SIZE[0] / SIZE[1], SHARE)
-        surface = self.evaluation.surface_points, self.evaluation.surface_triangles
-        return draw_still(surface, posed, capsules, [camera], SIZE)[0]
 
     def scene(self) -> TurningScene:
         """A scene that turns: organ, points in the colours of REACH_KINDS, arms as they are evaluated, ports, wall."""

@@ -200,11 +200,3 @@ def _norm(panels: list[Panel], scale: float) -> Normalize:
     known = np.concatenate([values[np.isfinite(values)] for _, _, values in panels]) * scale
     least, most = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     return Normalize(least, most if most > least else least + 1.0)
-
-
-def write_picture(image: NDArray[np.uint8], path: Path) -> Picture:
-    """Write the picture of the arms as a PNG file."""
-    from matplotlib.image import imsave
-
-    imsave(path, np.ascontiguousarray(image), format="png")
-    return Picture.of_file(path, "The arms at their ports", "Both arms, the endoscope, the ports and the wall.")

@@ -23,7 +23,6 @@ def write_report(
     evaluation: ArmsEvaluation,
     path: Path,
     *,
-    pictures: Sequence[Picture],
     maps: Sequence[Picture],
     command: str,
     ranking: Sequence[Ranked] = (),
@@ -33,7 +32,6 @@ def write_report(
     Args:
         evaluation: of both arms.
         path: of the file.
-        pictures: of the arms in the patient.
         maps: heat maps.
         command: the command line that repeats this report.
         ranking: of several placements or robots; left out if empty.
@@ -46,8 +44,7 @@ def write_report(
         ranking_rule=RANKING_RULE,
         number_text=number_text,
         scene=evaluation.turning,
-        poster=next(iter((*pictures, *maps)), None),
-        pictures=pictures,
+        poster=maps[0] if maps else None,
         maps=maps,
         colours={**PORT_COLOURS, "both": REACH_KINDS[0].colour},
         has_targets=evaluation.inner.any(),
@@ -55,6 +52,7 @@ def write_report(
         values=_values(evaluation),
         distances=[(title, *_spread_texts(getattr(evaluation, field), 1e3, 1)) for field, title, _ in DISTANCES],
         reasons=_reasons(evaluation),
+        with_errors=_with_errors(evaluation),
         cycle=cycle_section(evaluation),
         ports=_ports(evaluation),
         search=_search(evaluation.search),
@@ -129,6 +127,15 @@ def _reasons(evaluation: ArmsEvaluation) -> Rows:
     for index, reason in enumerate(REASONS):
         masks = [arm.reason == index for arm in evaluation.arms.values()]
         rows.append((reason, *(f"{int(mask.sum())} ({share_text(mask)})" for mask in masks)))
+    return rows
+
+
+def _with_errors(evaluation: ArmsEvaluation) -> Rows:
+    """Median and 95th percentile of the errors of tip and depth [mm], share still clear, for arms that state errors."""
+    rows = []
+    for side, arm in evaluation.with_errors.items():
+        spans = [np.percentile(values, (50.0, 95.0)) for values in (arm.tip_error, arm.depth_error)]
+        rows.append((f"{side} arm", *(number_text(value, 1e3, 1) for value in np.ravel(spans)), _per_cent(arm.kept)))
     return rows
 
 

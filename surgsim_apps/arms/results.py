@@ -60,6 +60,21 @@ class ArmReach:
 
 
 @dataclass(frozen=True)
+class ArmWithErrors:
+    """One arm at the points in its reach, its joints with draws of the errors that its file states.
+
+    Fields:
+        tip_error: distance of the tip from its place with exact joints [m]       (n_draw, n_reached)
+        depth_error: size of that along the surface's normal [m]                  (n_draw, n_reached)
+        kept: share of points and draws without contact of shaft and links
+    """
+
+    tip_error: FloatArray
+    depth_error: FloatArray
+    kept: float
+
+
+@dataclass(frozen=True)
 class ArmThroughCycle:
     """One arm while the organ moves, at every point and position.
 
@@ -184,11 +199,11 @@ class ArmsEvaluation:
         scene: name of the scene
         surface_points, surface_triangles: the organ's outer surface, for pictures            (n, 3), (m, 3)
         ports: of the arms ("left", "right") and the camera ("endoscope")
+        with_errors: of the arms whose files state errors of the joints, by side
         cycle: both arms while the patient breathes; None for a motionless one
         move: of a port, that lets both reach more; None where no move is worth it, or none was tried
         moves_tried: True if moves of the ports were tried
         search: for the ports; None without one
-        picture: of the arms in the patient, RGB, (height, width, 3) uint8; None without one
         turning: scene of the arms in the patient; None without one
     """
 
@@ -204,11 +219,11 @@ class ArmsEvaluation:
     surface_points: FloatArray
     surface_triangles: IntArray
     ports: Mapping[str, Port]
+    with_errors: Mapping[str, ArmWithErrors]
     cycle: ThroughCycle | None = None
     move: PortMove | None = None
     moves_tried: bool = False
     search: PortsFound | None = None
-    picture: NDArray[np.uint8] | None = None
     turning: TurningScene | None = None
 
     @property

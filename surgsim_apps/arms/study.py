@@ -13,7 +13,7 @@ from surgsim_apps.arms.arms_in_patient import ArmsInPatient
 from surgsim_apps.arms.capability import Capability, quartered
 from surgsim_apps.arms.clearance import Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
-from surgsim_apps.arms.pictures import ArmMaps, camera_view, write_picture
+from surgsim_apps.arms.pictures import ArmMaps, camera_view
 from surgsim_apps.arms.points_file import write_placements, write_points
 from surgsim_apps.arms.port_moves import best_move
 from surgsim_apps.arms.port_search import PortSearch, on_one_wall
@@ -30,10 +30,10 @@ from surgsim_apps.arms.reach import (
 from surgsim_apps.arms.report import write_report
 from surgsim_apps.arms.results import ArmsEvaluation, PortsFound
 from surgsim_apps.arms.through_cycle import evaluate_cycle
+from surgsim_apps.arms.with_errors import evaluate_errors
 from surgsim_apps.arms.wording import verdict
 from surgsim_apps.reports.output_folder import AnyFolder
 from surgsim_env.instruments import SIDES, load_arm
-from surgsim_env.rendering import NoGLError
 from surgsim_env.scene import Anatomy, ArmDescription, Scene, as_toml, load_anatomy, make_scene
 from surgsim_env.step_progress import StepProgress
 
@@ -41,11 +41,11 @@ from surgsim_env.step_progress import StepProgress
 PLACES_PER_POINT = 12
 # Points of a search for ports, and for moves of a port.
 SEARCH_POINTS = 48
-REPORT_NAME, POINTS_NAME, PICTURE_NAME = "report.html", "points.csv", "arms.png"
+REPORT_NAME, POINTS_NAME = "report.html", "points.csv"
 FOUND_NAME, PLACEMENTS_NAME = "ports.toml", "placements.csv"
-# All possible files of a study; the pictures depend on the arms and OpenGL.
+# All possible files of a study.
 RESULT_NAMES = (
-    *(REPORT_NAME, POINTS_NAME, PICTURE_NAME, FOUND_NAME, PLACEMENTS_NAME, "map_reach.png"),
+    *(REPORT_NAME, POINTS_NAME, FOUND_NAME, PLACEMENTS_NAME, "map_reach.png"),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
 )
 
@@ -61,7 +61,7 @@ def evaluate_arms(
     faced: Ports | None = None,
     progress: StepProgress | None = None,
     tables: Mapping[str, Capability] | None = None,
-    picture: bool = False,
+    turning: bool = False,
 ) -> ArmsEvaluation:
     """Evaluate two arms on a scene's organ at rest; the same arguments give the same result to the bit.
 
@@ -77,8 +77,7 @@ def evaluate_arms(
         faced: other ports that the points face, for a comparison.
         progress: shows the steps.
         tables: what each arm reaches, by side, to try moves of the ports.
-        picture: True for a scene and a picture of the arms in the patient; without OpenGL there is no picture,
-            `progress` says why.
+        turning: True for a scene of the arms in the patient.
 
     Raises:
         ValueError: a wrong scene, arm or port, in one line with the way out.
@@ -97,12 +96,14 @@ def evaluate_arms(
         load_arm(source, place.port, tip_radius=radius) for source, place in ((left, where.left), (right, where.right))
     )
     sites = find_sites(anatomy, where, count, seed, faced)
-    obstacles, reaches, around = Obstacles.of(anatomy, where), [], []
+    obstacles, reaches, around, with_errors = Obstacles.of(anatomy, where), [], [], {}
     for side, arm in zip(SIDES, arms, strict=True):
         with progress.step(f"the {side} arm at {len(sites.points)} points"):
             kinematics = BatchKinematics(arm)
             around.append(replace(obstacles, ball=tip_ball(kinematics)))
             reaches.append(evaluate_reach(kinematics, sites, around[-1]))
+            if effect := evaluate_errors(reaches[-1], sites, around[-1], seed):
+                with_errors[side] = effect
     with progress.step("both arms at once"):
         both = evaluate_both(reaches[0], reaches[1], sites.points)
     cycle = None
@@ -122,6 +123,7 @@ def evaluate_arms(
         surface_points=surface,
         surface_triangles=triangles,
         ports=where.frames,
+        with_errors=with_errors,
         cycle=cycle,
     )
     if tables is not None and not both.reachable[~sites.inner].all():
@@ -130,14 +132,10 @@ def evaluate_arms(
             quick = QuickReach(anatomy, tables, obstacles, sites.only(outer[:SEARCH_POINTS]))
             move = best_move(quick, where, both.reachable[outer], camera_view(evaluation))
         evaluation = replace(evaluation, move=move, moves_tried=True)
-    if picture:
+    if turning:
         given = None if faced == where else faced
         shown = ArmsInPatient.at_middle(evaluation, arms, both, where, given)
         evaluation = replace(evaluation, turning=shown.scene())
-        try:
-            evaluation = replace(evaluation, picture=shown.picture())
-        except NoGLError as error:
-            progress.say(f"no picture: {error}")
     return evaluation
 
 
@@ -222,7 +220,7 @@ def run_study(
     command: str,
     search_seconds: float | None = None,
 ) -> list[str]:
-    """Evaluate the setups, rank them if there are several, and write report, points, heat maps and picture.
+    """Evaluate the setups, rank them if there are several, and write report, points and heat maps.
 
     Args:
         setups: the reported one, then those of the comparison. The points of all face the ports of the first.
@@ -258,7 +256,7 @@ def run_study(
                     faced=given.ports,
                     progress=progress,
                     tables=tables if setup is setups[0] else None,
-                    picture=setup is setups[0],
+                    turning=setup is setups[0],
                 )
             )
         first = replace(evaluations[0], search=found)
@@ -269,10 +267,9 @@ def run_study(
         else []
     )
     write_points(first, folder / POINTS_NAME)
-    pictures = [] if first.picture is None else [write_picture(first.picture, folder / PICTURE_NAME)]
-    write_report(first, folder / REPORT_NAME, pictures=pictures, maps=maps, command=command, ranking=ranking)
+    write_report(first, folder / REPORT_NAME, maps=maps, command=command, ranking=ranking)
     console.print(verdict(first), highlight=False)
-    names = [REPORT_NAME, POINTS_NAME, *(drawing.name for drawing in (*pictures, *maps))]
+    names = [REPORT_NAME, POINTS_NAME, *(drawing.name for drawing in maps)]
     if found is not None:
         write_placements(found, folder / PLACEMENTS_NAME)
         (folder / FOUND_NAME).write_text(as_toml(found.best.ports), encoding="utf-8", newline="\n")

@@ -31,7 +31,7 @@ PORT_TABLES = {"left", "right", "endoscope"}
 class Arms:
     """Evaluate two arms on a patient's organ: reach of each and of both at once, clearances, forces, dexterity.
 
-    Writes report.html (self-contained), points.csv, heat maps and a picture (PNG). See docs/arms_report.md.
+    Writes report.html (self-contained), points.csv and heat maps (PNG). See docs/arms_report.md.
     """
 
     left: Text
@@ -74,7 +74,7 @@ class Arms:
         return shlex.join([*words, *map(str, counts)])
 
     def run(self, console: Console) -> int:
-        """Evaluate and write report.html, points.csv, the heat maps and a picture of the arms.
+        """Evaluate and write report.html, points.csv, and the heat maps.
 
         Raises:
             ValueError: an impossible option, in one line.

@@ -228,6 +228,11 @@ class Instrument(ToolBodies):
         return self.data.site_xpos[self._tip].copy()
 
     @property
+    def tip_reading(self) -> FloatArray:
+        """Position of the tip by the joints' encoders [m], (3,); of exact joints `tip_position`."""
+        return self.tip_position
+
+    @property
     def tip_velocity(self) -> FloatArray:
         """Velocity of the tip [m/s], shape (3,)."""
         mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_SITE, self._tip, self._velocity, 0)
@@ -238,6 +243,9 @@ class Instrument(ToolBodies):
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, data.site_xmat[self._tip])
         return data.site_xpos[self._tip].copy(), quaternion
+
+    def draw_errors(self, rng: np.random.Generator) -> None:
+        """Draw the errors of the joints for an episode; of exact joints none."""
 
     def place(self, position: FloatArray) -> None:
         """Place the tip at rest at a position [m] and reset all else; a jaw with pads is open."""

@@ -244,7 +244,7 @@ class SitePress:
         self._over = force_peak > self._hard_force
         if phase.read or self._over:
             surface = self.point + self.simulation.ground_shift(self.point)
-            below = matmul(surface - self.simulation.instrument.tip_position, self.normal) + self._radius
+            below = matmul(surface - self.simulation.instrument.tip_reading, self.normal) + self._radius
             self.readings.append((self.simulation.contact_force, float(below)))
             if (patches := self.simulation.instrument.patches) is not None:
                 self._taxels.append(patches.forces)

@@ -4,7 +4,7 @@ import contextlib
 import math
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -24,13 +24,12 @@ from surgsim_env.rendering.painted_fields import PAINTED_FIELDS, PaintedField, d
 from surgsim_env.rendering.scene_model import (
     add_instrument,
     add_lights,
-    add_tissue,
     compile_scene,
     empty_scene,
     find_instrument,
 )
 from surgsim_env.rendering.stage import LOCK, Canvas, Stage, borrow_stage, give_back_stage
-from surgsim_env.rendering.surface import Shape, drawn_surface
+from surgsim_env.rendering.surface import Shape
 from surgsim_env.rendering.tissue import Tissue
 from surgsim_env.scene.anatomy import Anatomy
 from surgsim_env.tasks.visibility import Disc
@@ -226,69 +225,43 @@ def ground_shadow(
     return Shape(flat, np.tile(up, (len(flat), 1)), triangles[lit])
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnCapsule:
-    """Capsule, or a ball if both ends coincide.
-
-    Fields:
-        ends: of its axis [m]                                                       (2, 3)
-        radius: [m]                                                                 scalar
-        colour: red, green, blue, opacity                                           (4,)
-    """
-
-    ends: FloatArray
-    radius: float
-    colour: tuple[float, float, float, float]
-
-
-def draw_still(
-    surface: tuple[FloatArray, IntArray] | None,
-    arms: Sequence[tuple[mujoco.MjModel, mujoco.MjData]],
-    capsules: Sequence[DrawnCapsule],
-    cameras: Sequence[Camera],
+def draw_arm_still(
+    arm: mujoco.MjModel,
+    posed: mujoco.MjData,
+    ball: FloatArray,
+    colour: tuple[float, ...],
+    camera: Camera,
     size: tuple[int, int],
-) -> list[NDArray[np.uint8]]:
-    """Draw a picture (height, width, 3) for each camera.
+) -> NDArray[np.uint8]:
+    """Draw a picture (height, width, 3) of an arm alone.
 
     Args:
-        surface: points [m] (n_node, 3) and outward triangles (n_triangle, 3) of the organ; None without one.
-        arms: models and data, with computed kinematics.
-        capsules: further shapes.
-        cameras: the first one's `up` is the scene's.
+        arm: its model.
+        posed: its data, with computed kinematics.
+        ball: middle and radius of a ball to show beside it [m], (4,).
+        colour: of the ball.
+        camera: its `up` is the scene's.
         size: width and height [pixels].
 
     Raises:
         NoGLError: there is no OpenGL; names the missing packages.
     """
     context = gl.context()
-    organ = None if surface is None else drawn_surface(*surface)
     spec = empty_scene(*size, STILL_BACKGROUND, far=STILL_FAR)
-    add_lights(spec, -cameras[0].up)
-    if organ is not None:
-        add_tissue(spec, "organ", organ.vertex_count, len(organ.faces))
-    for number, (model, _) in enumerate(arms):
-        add_instrument(spec, model, f"arm_{number}")
-    for capsule in capsules:
-        geom = spec.worldbody.add_geom(rgba=capsule.colour, contype=0, conaffinity=0, size=[capsule.radius, 0.0, 0.0])
-        if np.array_equal(*capsule.ends):
-            geom.type, geom.pos = mujoco.mjtGeom.mjGEOM_SPHERE, capsule.ends[0]
-        else:
-            geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, capsule.ends.ravel()
-    model, data, meshes = compile_scene(spec, [] if organ is None else ["organ"])
-    for number, (arm, arm_data) in enumerate(arms):
-        find_instrument(model, arm, f"arm_{number}").pose(arm_data, data)
+    add_lights(spec, -camera.up)
+    add_instrument(spec, arm, "arm")
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    spec.worldbody.add_geom(type=sphere, rgba=colour, contype=0, conaffinity=0, pos=ball[:3], size=[ball[3], 0.0, 0.0])
+    model, data, _ = compile_scene(spec, [])
+    find_instrument(model, arm, "arm").pose(posed, data)
     with LOCK:
         context.make_current()
         canvas = Canvas(model, data, context)
         canvas.select()
-        if surface is not None and organ is not None:
-            meshes["organ"].upload(Shape(*organ.follow(surface[0]), organ.faces), canvas.context)
-        frames = []
-        for camera in cameras:
-            canvas.look(camera)
-            frames.append(canvas.colour())
+        canvas.look(camera)
+        frame = canvas.colour()
         canvas.close()
-    return frames
+    return frame
 
 
 # ---- the tissue's force on each tool: an arrow with its size in newtons over a finished picture --------------------

@@ -4,6 +4,10 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, require_known, scenes_folder
 from surgsim_env.scene.model import Taxels, Vector, require_direction, require_number
 
@@ -95,6 +99,34 @@ class JointControl:
 
 
 @dataclass(frozen=True)
+class JointErrors:
+    """Errors of joints whose encoders sit at the motors, behind cables, of hinges [rad] and of slides [m].
+
+    Args:
+        turn_offset, slide_offset: largest constant error; each episode draws one for each joint from [-offset, offset].
+        turn_play, slide_play: half the width of the loop of a joint that turns back.
+        turn_drift, slide_drift: largest rate of an offset [rad/s], [m/s], drawn likewise.
+    """
+
+    turn_offset: float = 0.0
+    slide_offset: float = 0.0
+    turn_play: float = 0.0
+    slide_play: float = 0.0
+    turn_drift: float = 0.0
+    slide_drift: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            unit = ("rad" if name.startswith("turn") else "m") + ("/s" if name.endswith("drift") else "")
+            require_number(f"joint_errors.{name}", value, 0.0, unit)
+
+    def of(self, hinges: NDArray[np.bool_]) -> FloatArray:
+        """Largest offset, play and largest drift of joints, by a mask of hinges (n,), as (3, n)."""
+        turn, slide = np.array(list(vars(self).values())).reshape(3, 2).T[:, :, None]
+        return np.where(hinges, turn, slide)
+
+
+@dataclass(frozen=True)
 class AddedShape:
     """Capsule or ball added to the model: tissue contacts spheres and capsules, not meshes.
 
@@ -152,6 +184,7 @@ class ArmDescription:
         dropped_meshes: file names of left out meshes of a URDF, as in the URDF.
         description: one line.
         taxels: on the tip or the jaw's pads; a scene takes them into its `instrument`.
+        joint_errors: for scenes with `instrument.joint_errors`; None: the joints are exact there too.
     """
 
     name: str
@@ -173,6 +206,7 @@ class ArmDescription:
     dropped_meshes: tuple[str, ...] = ()
     description: str = ""
     taxels: Taxels | None = None
+    joint_errors: JointErrors | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -48,6 +48,7 @@ class Level:
         motion: preset of the patient's motion, unless the environment's arguments name one; None: the scene's motions.
         map_error: standard deviation of the healthy map's offset from the organ along each side of the chart [m]; each
             episode draws one.
+        joint_errors: True for the errors of joints that an arm's file states.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Level:
     tissue: str | None = None
     motion: str | None = None
     map_error: float = 0.0
+    joint_errors: bool = False
 
     def scene(self, scene: Scene) -> Scene:
         """Scene at this level: with its sensor and tissue, and mass scaling for stiffer tissue.
@@ -84,6 +86,7 @@ class Level:
         if instrument.taxels is not None:
             taxels = replace(instrument.taxels, noise=instrument.taxels.noise * self.sensor_noise)
             instrument = replace(instrument, taxels=taxels)
+        instrument = replace(instrument, joint_errors=instrument.joint_errors or self.joint_errors)
         return replace(healthy, sensor=sensor, instrument=instrument, timing=replace(healthy.timing, mass_scaling=True))
 
     def healthy(self, scene: Scene) -> Scene:
@@ -275,6 +278,7 @@ LEVELS: Mapping[str, Level] = {
             tissue="pig_liver_ex_vivo_relaxing",
             motion="calm",
             map_error=0.004,
+            joint_errors=True,
         ),
     )
 }

@@ -294,6 +294,7 @@ class SceneInstrument:
         approach: direction of its motion to the organ, and of its shaft.
         tip_direction: direction of a grasper's jaw and an arm's tip; by default the approach.
         taxels: on the tip or the jaw's pads; of an arm those of its own file.
+        joint_errors: True for the errors of joints that an arm's own file states, False for exact joints.
     """
 
     model: str = "probe.xml"
@@ -301,6 +302,7 @@ class SceneInstrument:
     approach: Vector = (0.0, 0.0, -1.0)
     tip_direction: Vector | None = None
     taxels: Taxels | None = None
+    joint_errors: bool = False
 
     def __post_init__(self) -> None:
         require_number("instrument.tip_radius", self.tip_radius, 0.0, "m", above=True)

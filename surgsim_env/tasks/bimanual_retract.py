@@ -96,7 +96,7 @@ class BimanualRetractTask(RetractTask):
         *RetractTask.channels,
         replace(
             TIP_POSITION, name="right_position", bounds_text="the lobe's bounding box with a margin",
-            read=lambda task, simulation: _right(simulation).tip_position,
+            read=lambda task, simulation: _right(simulation).tip_reading,
             meaning="right tip's position: the centre of its ball",
         ),
         Channel(

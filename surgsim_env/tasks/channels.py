@@ -22,7 +22,7 @@ TIP_POSITION = Channel(
     "tip_position", 3, "m",
     low=lambda task, instrument: instrument.lower - POSITION_SLACK,
     high=lambda task, instrument: instrument.upper + POSITION_SLACK,
-    read=lambda task, simulation: simulation.instrument.tip_position,
+    read=lambda task, simulation: simulation.instrument.tip_reading,
     meaning="tip position", bounds_text="the organ's bounding box with a margin",
     scale=LENGTH_SCALE, origin=lambda task, instrument: 0.5 * (instrument.lower + instrument.upper),
 )  # fmt: skip

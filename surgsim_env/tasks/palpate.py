@@ -395,8 +395,8 @@ class PalpateTask(Task):
         self._declare_value = float(commands["declare"][0])
 
     def resting_place(self, simulation: Simulation) -> FloatArray:
-        """Tip position relative to the organ at rest [m], (3,): less the displacement of the ground there."""
-        tip = simulation.instrument.tip_position
+        """Tip position by the encoders relative to the organ at rest [m], (3,): less the ground's displacement."""
+        tip = simulation.instrument.tip_reading
         return tip - simulation.ground_shift(tip)
 
     def update(self, step: ControlStep) -> None:

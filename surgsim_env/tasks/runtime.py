@@ -131,6 +131,7 @@ class TaskRuntime:
                 )
             anatomy = self.task.anatomy
             simulation.take_anatomy(anatomy)
+            simulation.instrument.draw_errors(rng)
             simulation.reset(self.task.drawn.compiled(anatomy), tip_position)
             if any(map(simulation.covers, tip_position.reshape(-1, 3))):
                 raise ValueError(

@@ -293,7 +293,7 @@ class SlideTask(Task):
     def update(self, step: ControlStep) -> None:
         """Locate the tip over the registered surface, and score the declared map."""
         simulation = step.simulation
-        tip = simulation.instrument.tip_position
+        tip = simulation.instrument.tip_reading
         tip = tip - simulation.ground_shift(tip)
         self.place = self.charted.chart.place(tip)
         registered = tip + self.registration

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from surgsim_apps.arms.results import ArmReach, ArmsEvaluation, ArmThroughCycle, ThroughCycle
+from surgsim_apps.arms.results import ArmReach, ArmsEvaluation, ArmThroughCycle, ArmWithErrors, ThroughCycle
 from surgsim_apps.reports.surface_drawing import tube
 from surgsim_env.scene.model import Port
 
@@ -14,7 +14,6 @@ PORTS = {
     "right": Port((-0.08, -0.09, 0.09), (0.55, 0.6, -0.6)),
     "endoscope": Port((0.0, -0.12, 0.11), (0.0, 0.74, -0.67)),
 }
-PICTURE = np.arange(40 * 60 * 3, dtype=np.int64).reshape(40, 60, 3).astype(np.uint8)
 
 
 def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0, 9.0), clearance=(0.004, 0.05)):
@@ -44,9 +43,7 @@ def made_reach(name, points, reachable, generator, *, joint_count=6, force=(2.0,
     )
 
 
-def made_evaluation(
-    *, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), picture=True, **reach
-):
+def made_evaluation(*, count=120, inner_count=10, seed=0, left_to=0.3, right_to=0.3, joint_counts=(6, 6), **reach):
     """Two arms, the left one reaching what lies at x > -left_to of the half axis, the right one at x < right_to."""
     generator = np.random.default_rng(seed)
     sphere, triangles = tube(np.zeros(3), np.zeros(3), 1.0)
@@ -81,7 +78,7 @@ def made_evaluation(
         surface_points=sphere * HALF_AXES,
         surface_triangles=triangles,
         ports=PORTS,
-        picture=PICTURE if picture else None,
+        with_errors={"left": ArmWithErrors(np.full((2, 3), 0.003), np.full((2, 3), 0.001), 0.9)},
     )
 
 

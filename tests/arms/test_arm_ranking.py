@@ -10,7 +10,7 @@ from tests.arms.made import made_cycle, made_evaluation
 
 def case(name, *, both, clearance=0.010, force=3.0, left=0.8, right=0.8):
     """A made case: shares of 100 points, the clearance [m] and the force [N] at each of them."""
-    evaluation = made_evaluation(count=100, inner_count=0, picture=False)
+    evaluation = made_evaluation(count=100, inner_count=0)
     arms = {}
     for side, share in (("left", left), ("right", right)):
         reached = np.arange(100) < round(100 * share)

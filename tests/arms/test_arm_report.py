@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_apps.arms.pictures import ArmMaps, write_picture
+from surgsim_apps.arms.pictures import ArmMaps
 from surgsim_apps.arms.points_file import columns, write_points
 from surgsim_apps.arms.quantities import QUANTITIES
 from surgsim_apps.arms.report import write_report
 from surgsim_apps.arms.results import REASONS
 from surgsim_apps.arms.wording import number_text, verdict
-from tests.arms.made import PICTURE, made_evaluation
+from tests.arms.made import made_evaluation
 
 VOID = {"meta", "link", "img", "br"}
 
@@ -68,11 +68,9 @@ def folder(evaluation, tmp_path_factory):
 
 
 def written(evaluation, folder):
-    drawn = evaluation.picture
-    pictures = [] if drawn is None else [write_picture(drawn, folder / "arms.png")]
     maps = ArmMaps(evaluation).write_all(folder)
     write_points(evaluation, folder / "points.csv")
-    write_report(evaluation, folder / "report.html", pictures=pictures, maps=maps, command="surgsim arms <b>&amp;")
+    write_report(evaluation, folder / "report.html", maps=maps, command="surgsim arms <b>&amp;")
     return folder
 
 
@@ -117,6 +115,10 @@ def test_tables_show_shares_and_reasons(evaluation, page):
     for index, reason in enumerate(REASONS):
         counts = [int((arm.reason == index).sum()) for arm in (evaluation.left, evaluation.right)]
         assert [int(cell.split()[0]) for cell in page.row(reason)[1:]] == counts
+
+
+def test_errors_of_joints_are_shown_of_arms_that_state_them(page):
+    assert page.row("left arm")[1:] == ["3.0", "3.0", "1.0", "1.0", "90 %"]
 
 
 def test_the_worse_of_both_is_the_less_useful(evaluation):
@@ -174,7 +176,7 @@ def test_the_page_is_whole_and_stands_alone(folder, page):
 
 def test_the_page_says_the_verdict_first(evaluation, page):
     text = "".join(page.text)
-    parts = ["The arms in the patient", "Maps on the organ", "Numbers", "What each figure means"]
+    parts = ["Maps on the organ", "Numbers", "What each figure means"]
     body = text[text.index("Contents") :] if "Contents" in text else text
     assert text.index(verdict(evaluation)) < text.index("Who reaches what")
     places = [body.rindex(part) for part in parts]
@@ -190,8 +192,6 @@ def test_every_map_is_a_picture_with_something_in_it(folder):
     for path in maps:
         image = imread(path)
         assert len(np.unique(image.reshape(-1, image.shape[2])[:, :3], axis=0)) > 100, path.name
-    given = imread(folder / "arms.png")
-    np.testing.assert_array_equal(np.round(given[:, :, :3] * 255), PICTURE)
 
 
 def test_the_map_is_grey_just_where_neither_arm_reaches(evaluation):
@@ -228,7 +228,7 @@ def test_nothing_is_painted_where_no_point_was_tried(evaluation):
 
 @pytest.mark.slow
 def test_nothing_reached_is_told_as_that(tmp_path):
-    evaluation = made_evaluation(left_to=-2.0, right_to=-2.0, picture=False)
+    evaluation = made_evaluation(left_to=-2.0, right_to=-2.0)
     assert not evaluation.left.reachable.any()
     assert "reaches 0 %" in verdict(evaluation)
     page = Page((written(evaluation, tmp_path) / "report.html").read_text(encoding="utf-8"))

@@ -45,7 +45,7 @@ def made(monkeypatch):
     """In place of the evaluation, made-up ones: wider ports reach more, another arm less. Lists what was asked for."""
     asked = []
 
-    def evaluate(anatomy, left, right, ports, *, seed, count, faced, progress, picture, tables):
+    def evaluate(anatomy, left, right, ports, *, seed, count, faced, progress, turning, tables):
         asked.append((left, right, ports))
         reach = 0.6 if ports.left.point[0] < -0.05 else 0.1 if left.name == "six_axis" else 0.3
         return made_evaluation(count=count, seed=seed, left_to=reach, right_to=reach)
@@ -82,7 +82,7 @@ def test_a_search_writes_the_ports_found_and_ranks_them_with_the_given(folder, m
 def test_the_files(folder, made, capsys):
     assert main(arguments("--seed", "3", left="mine.toml")) == 0
     names = {path.name for path in (folder / "out").iterdir()}
-    assert {"report.html", "points.csv", "map_reach.png", "map_tip_force.png", "arms.png"} <= names
+    assert {"report.html", "points.csv", "map_reach.png", "map_tip_force.png"} <= names
     output = " ".join(capsys.readouterr().out.split())
     assert "the left arm reaches" in output and "written: out/{report.html" in output
     assert "drawing the maps ..." in output
@@ -100,7 +100,7 @@ def test_a_run_repeats_to_the_byte_wherever_it_is_written(folder, made, tmp_path
     assert main(arguments(*compared, ports=str(folder / "ports.toml"), out=other)) == 0
     assert main(arguments(*compared, "--seed", "1", out="c")) == 0
     names = {path.name for path in other.iterdir()}
-    assert {"map_reach.png", "map_tip_force.png", "arms.png", "report.html"} < names
+    assert {"map_reach.png", "map_tip_force.png", "report.html"} < names
     for name in names:
         first = (folder / "a" / name).read_bytes()
         assert first == (other / name).read_bytes(), name

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from surgsim_apps.arms.pictures import ArmMaps, write_picture
+from surgsim_apps.arms.pictures import ArmMaps
 from surgsim_apps.arms.ranking import rank
 from surgsim_apps.arms.report import write_report
 from surgsim_apps.reports.html_page import POLICY, SCENE_POLICY
@@ -52,7 +52,6 @@ def report(tmp_path_factory) -> Path:
     write_report(
         evaluation,
         path,
-        pictures=[write_picture(evaluation.picture, folder / "arms.png")],
         maps=ArmMaps(evaluation).write_all(folder),
         command="surgsim arms --scene liver --left psm_grasper --right psm_palpator --ports ports.toml",
         ranking=rank(others),

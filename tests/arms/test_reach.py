@@ -1,6 +1,7 @@
 """Points that an arm reaches, against known sets; and what stops it, with obstacles put in its way."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.ports import EndoscopePort, PortPlace, Ports, Wall
 from surgsim_apps.arms.reach import ARM_DISTANCE, Sites, evaluate_both, evaluate_reach, tip_ball
 from surgsim_apps.arms.results import REASONS
+from surgsim_apps.arms.with_errors import DRAWS, evaluate_errors
 from surgsim_env.instruments.arm.arm import load_arm
+from surgsim_env.scene import JointErrors
 from surgsim_env.scene.model import Port
 from tests.arms.pivot_arm import RADIUS, SITE, TABLE, pivot, pivot_excess, write_pivot
 from tests.instruments.joints import random_joints
@@ -66,6 +69,29 @@ def test_pivot_reaches_its_cone_and_depths_and_nothing_else(tmp_path):
     assert {REASONS[index] for index in report.reason[~inside]} == {"a joint limit"}
     assert np.isnan(report.manipulability[~inside]).all() and not np.isnan(report.manipulability[inside]).any()
     assert report.position_error[inside].max() < 1e-6
+
+
+def test_errors_of_the_joints_at_the_points_in_reach(tmp_path):
+    """A slide's offset moves the tip along the shaft by itself; a plate beside it is then touched or not at all."""
+    description = pivot(tmp_path)
+    sites = surface_sites([[0.0, 0.0, -0.1], [0.03, 0.02, -0.12], [0.0, 0.0, -5.0]])
+
+    def effect(errors):
+        arm = load_arm(replace(description, joint_errors=errors), Port())
+        reach = evaluate_reach(BatchKinematics(arm), sites, around())
+        return evaluate_errors(reach, sites, around(), seed=0)
+
+    assert effect(None) is None
+    exact, moved = effect(JointErrors()), effect(JointErrors(slide_offset=0.002))
+    assert exact.tip_error.shape == (DRAWS, 2) and exact.tip_error.max() == 0.0 and exact.kept == 1.0
+    assert 1e-4 < moved.tip_error.max() <= 0.002 and moved.kept == 1.0
+    np.testing.assert_allclose(moved.tip_error[:, 0], moved.tip_error[:, 1], atol=1e-9)
+    depth = np.linalg.norm(sites.points[:2], axis=1)
+    np.testing.assert_allclose(
+        moved.depth_error / moved.tip_error, np.tile(-sites.points[:2, 2] / depth, (DRAWS, 1)), rtol=1e-6
+    )
+    turned = effect(JointErrors(turn_play=0.01)).tip_error
+    assert turned[:, 0].std() > 1e-5 and (turned <= 0.02 * depth).all()
 
 
 @pytest.mark.slow

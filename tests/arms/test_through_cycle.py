@@ -87,16 +87,16 @@ def test_a_point_at_the_edge_of_reach_is_lost_where_the_organ_takes_it_out(tmp_p
 
 @pytest.fixture(scope="module")
 def evaluation():
-    made = made_evaluation(picture=False)
+    made = made_evaluation()
     return replace(made, cycle=made_cycle(made))
 
 
 def test_the_report_shows_what_the_arrays_hold(evaluation, tmp_path):
-    write_report(evaluation, tmp_path / "r.html", pictures=(), maps=(), command="surgsim arms")
+    write_report(evaluation, tmp_path / "r.html", maps=(), command="surgsim arms")
     page, cycle, outer = Page((tmp_path / "r.html").read_text(encoding="utf-8")), evaluation.cycle, ~evaluation.inner
     shares = [f"{100 * value:.0f} %" for value in cycle.left.reachable[:, outer].mean(axis=1)]
     always, path = (f"{100 * mask[outer].mean():.0f} %" for mask in (cycle.left.always, cycle.left.has_path))
-    assert page.row("left arm") == ["left arm", *shares, always, path]
+    assert page.row("left arm", 1) == ["left arm", *shares, always, path]
     row = page.row("left arm: clearance [mm]")
     assert row[1] == f"{1e3 * np.nanmin(cycle.left.clearance[:, outer]):.2f}"
 

@@ -52,6 +52,16 @@ class SteeredArms(Instrument):
         forces = [norm(arm.trocar_force) for arm in self.arms.values() if arm.trocar_force is not None]
         return float(max(forces)) if forces else None
 
+    @property
+    def tip_reading(self) -> FloatArray:
+        """Position of the tip, of two arms the left one's, by the joints' encoders [m], (3,)."""
+        return next(iter(self.arms.values())).tip_reading
+
+    def draw_errors(self, rng: np.random.Generator) -> None:
+        """Draw the errors of each arm's joints for an episode; of exact joints none."""
+        for arm in self.arms.values():
+            arm.deviation.draw(rng)
+
     def get_state(self) -> FloatArray:
         """Whole state of the instrument, with commands and commanded directions, as a vector."""
         return np.concatenate([super().get_state(), *(arm.get_state() for arm in self.arms.values())])
@@ -93,6 +103,7 @@ class ArmInstrument(SteeredArms):
             np.arange(count),
             direction=start_direction(scene),
             control_step=scene.timing.control_step,
+            joint_errors=scene.instrument.joint_errors,
             jaw=self.jaw,
         )
         self.arms = {"": self.steered}

@@ -87,6 +87,7 @@ class Pair(SteeredArms):
                 places,
                 direction=start_direction(scene),
                 control_step=scene.timing.control_step,
+                joint_errors=scene.instrument.joint_errors,
                 jaw=jaw,
                 prefix=f"{side}_",
             )

@@ -17,6 +17,7 @@ from surgsim_env.instruments.arm.inverse_kinematics import (
     turn_matrix,
     turn_towards,
 )
+from surgsim_env.instruments.arm.joint_deviation import JointDeviation
 from surgsim_env.instruments.arm.model import CANNULA, WALL_JOINTS
 from surgsim_env.instruments.instrument import Instrument, Jaw
 from surgsim_env.instruments.tool_bodies import frame_along
@@ -32,7 +33,8 @@ class SteeredArm:
 
     Once per control step `command_velocity` computes the joint values for the tip's target at the end of the step
     (`inverse_kinematics.follow`) and commands constant joint speeds towards them; the servo integrates them at haptic
-    rate. Joint targets continue from the last ones, so the path does not drift.
+    rate. Joint targets continue from the last ones, so the path does not drift. With errors of the joints all this is
+    computed from what the encoders say.
 
     For a tip without pads only the direction is controlled, and it may roll. For a jaw with pads the whole frame is
     controlled, with the pads facing each other vertically.
@@ -41,6 +43,7 @@ class SteeredArm:
         arm: its kinematics, compiled alone
         lower, upper: the box of the tip [m]                                     (3,)
         jaw: None without one
+        deviation: of the joints from their encoders
         goal: commanded direction of the tip (3,), or its frame if a jaw has pads (3, 3)
         short: True if the box, a joint's limit or its speed limit stopped the commanded motion
     """
@@ -53,6 +56,7 @@ class SteeredArm:
         *,
         direction: FloatArray,
         control_step: float,
+        joint_errors: bool = False,
         jaw: Jaw | None = None,
         prefix: str = "",
     ) -> None:
@@ -64,6 +68,7 @@ class SteeredArm:
             places: indices of the arm's joints in the servo, (n,).
             direction: of the tip at the start, (3,).
             control_step: duration of a commanded velocity [s].
+            joint_errors: True for the errors that the arm's description states, False for exact joints.
             jaw: of the arm.
             prefix: of the names of the arm's parts in the instrument's model.
         """
@@ -76,6 +81,8 @@ class SteeredArm:
         instrument.servo.lower[places], instrument.servo.upper[places] = arm.lower, arm.upper
         self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
         self._velocity = np.zeros(6)
+        hinges = np.array([arm.model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in arm.joints])
+        self.deviation = JointDeviation(arm.description.joint_errors if joint_errors else None, hinges)
         wall = arm.port.wall
         self._wall = None if wall is None else [model.joint(prefix + name).id for name in WALL_JOINTS]
         self._cannula = None if wall is None else int(model.joint(prefix + CANNULA).qposadr[0])
@@ -92,6 +99,13 @@ class SteeredArm:
     def tip_position(self) -> FloatArray:
         """Position of the tip [m], shape (3,): centre of the ball, or middle between the pads."""
         return self._instrument.data.site_xpos[self._tip].copy()
+
+    @property
+    def tip_reading(self) -> FloatArray:
+        """Position of the tip by the joints' encoders [m], (3,); of exact joints `tip_position`."""
+        if self.deviation.exact:
+            return self.tip_position
+        return self.arm.tip_pose(self.joint_positions - self.deviation.value).position
 
     @property
     def tip_rotation(self) -> FloatArray:
@@ -151,6 +165,7 @@ class SteeredArm:
         data.qpos[self._qpos] = np.append(solution.joints, self.arm.followers.values(solution.joints))
         data.ctrl[servo.position[self._places]] = solution.joints
         servo.command[self._places] = 0.0
+        self.deviation.begin(solution.joints)
         if self._cannula is not None:
             data.qpos[self._cannula] = self.arm.trocar_place(solution.joints)
         if self.jaw is not None:
@@ -166,7 +181,8 @@ class SteeredArm:
         Valid for one control step; after it the joints continue at the same speeds.
         """
         duration, servo = self._control_step, self._instrument.servo
-        joints = self._instrument.data.ctrl[servo.position[self._places]]
+        targets = self._instrument.data.ctrl[servo.position[self._places]]
+        joints = targets - self.deviation.value
         if not np.isfinite(joints).all():
             # MuJoCo's own warning ends the episode.
             servo.command[self._places] = 0.0
@@ -178,12 +194,12 @@ class SteeredArm:
         held = np.clip(target, self.lower, self.upper)
         if not np.any(velocity) and self._points_well(joints, pose.rotation):
             self.short = False
-            servo.command[self._places] = 0.0
+            servo.command[self._places] = (self.deviation.follow(joints, duration) - targets) / duration
             return
         direction, frame = (None, self.goal) if self.goal.ndim == 2 else (self.goal, None)
         step = follow(self.arm, joints, held, direction, duration, rotation=frame)
         self.short = step.limited or bool((held != target).any())
-        servo.command[self._places] = (step.joints - joints) / duration
+        servo.command[self._places] = (self.deviation.follow(step.joints, duration) - targets) / duration
 
     def command_jaw(self, target: float) -> None:
         """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.
@@ -196,13 +212,14 @@ class SteeredArm:
         self.jaw.command(target)
 
     def get_state(self) -> FloatArray:
-        """State beyond MuJoCo's and the servo's, `goal` and `short`, as a vector."""
-        return np.append(self.goal.ravel(), float(self.short))
+        """State beyond MuJoCo's and the servo's: `goal`, `short` and the deviation's, as a vector."""
+        return np.concatenate([self.goal.ravel(), [float(self.short)], self.deviation.get_state()])
 
     def set_state(self, state: FloatArray) -> None:
         """Restore a state from `get_state`, to the bit."""
-        self.goal = state[:-1].reshape(self.goal.shape).copy()
-        self.short = bool(state[-1])
+        size = self.goal.size
+        self.goal, self.short = state[:size].reshape(self.goal.shape).copy(), bool(state[size])
+        self.deviation.set_state(state[size + 1 :])
 
     def _turn_goal(self, turn: FloatArray, rotation: FloatArray) -> None:
         if self.goal.ndim == 2:

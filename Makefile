@@ -9,7 +9,7 @@ SUITABLE := $(if $(PYTHON),sys.version_info >= (3, 11),(3, 11) <= sys.version_in
 
 # The versions that make installs, for Python 3.11 to 3.13; `make lock` renews them.
 CONSTRAINTS := constraints.txt
-LOCKED := dev agents demonstrations video distributed bench
+LOCKED := dev agents demonstrations video bench
 UV := uv==0.13.9
 
 # Asked for before the `agents` extra, so that a CPU build of just this version is taken where pip is shown one.
@@ -17,7 +17,6 @@ TORCH := torch==2.13.0
 WITH_AGENTS := --editable=.[dev,agents,demonstrations,video]
 # Trainers of docs/training_loops.md, MIT. SuperSuit's tinyscaler has no wheels for later versions of Python.
 TRAINERS := torchrl==0.14.1 'supersuit==3.11.0;python_version<"3.13"'
-WITH_RAY := --editable=.[dev,distributed]
 # LeRobot asks for numpy below 2.3, this project for 2.3 or later, and LeRobot runs with it: pip installs the second over
 # the first, and says so.
 WITH_LEROBOT := lerobot[dataset]==0.6.1 --editable=.[dev,demonstrations]
@@ -25,7 +24,7 @@ WITH_LEROBOT := lerobot[dataset]==0.6.1 --editable=.[dev,demonstrations]
 # A file's tests run in one worker, which makes what they share once.
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
-.PHONY: help demo test test-all test-agents test-agents-all test-distributed with-ray test-lerobot with-lerobot \
+.PHONY: help demo test test-all test-agents test-agents-all test-lerobot with-lerobot \
     test-newest with-newest test-oldest with-oldest lock with-uv bench soak docs lint dist test-dist committed release clean distclean
 .NOTPARALLEL:
 
@@ -34,7 +33,6 @@ help:
 	@echo "make test         the tests (PYTEST_ARGS='-n 2 --dist loadfile' is the default)"
 	@echo "make test-all     the slow ones too"
 	@echo "make test-agents  those that need stable-baselines3 (installs torch); make test-agents-all the slow ones too"
-	@echo "make test-distributed  those that need Ray, in $(VENV)-distributed (installs 2.2 GB)"
 	@echo "make test-lerobot  those that need LeRobot, in $(VENV)-lerobot (Python 3.12 or 3.13; installs 5 GB)"
 	@echo "make test-newest  the core's and the environments' with the newest versions that are allowed, in $(VENV)-newest"
 	@echo "make test-oldest  the same with the lowest ones, in $(VENV)-oldest (Python 3.11)"
@@ -70,14 +68,7 @@ test-agents: $(VENV)/.ready-agents
 test-agents-all: $(VENV)/.ready-agents
 	$(PY) -m pytest $(PYTEST_ARGS) -m agents
 
-# Ray in an environment of its own: what agents need is tested without it, it without what they need.
-test-distributed:
-	@$(MAKE) --no-print-directory VENV=$(VENV)-distributed with-ray
-
-with-ray: $(VENV)/.ready-distributed
-	$(PY) -m pytest tests/agents -m "distributed and not slow"
-
-# LeRobot 0.6 likewise, from Python 3.12 on.
+# LeRobot 0.6 in an environment of its own, from Python 3.12 on.
 test-lerobot:
 	@$(MAKE) --no-print-directory VENV=$(VENV)-lerobot with-lerobot
 
@@ -182,7 +173,7 @@ committed:
 	    || { echo "surgsim: v$(VERSION) is tagged already: raise the version in pyproject.toml" >&2; exit 1; }
 
 release: ALONE = --all
-release: committed lint docs test-all test-agents-all test-distributed test-lerobot test-dist
+release: committed lint docs test-all test-agents-all test-lerobot test-dist
 	@$(MAKE) --no-print-directory committed
 	git tag -a v$(VERSION) -m "surgsim $(VERSION)"
 	@echo "surgsim: tagged v$(VERSION); its notes are in CHANGELOG.md; publish dist/ and the tag by hand"
@@ -192,7 +183,7 @@ clean:
 	find msdm_core surgsim_env surgsim_apps agents benchmarks docs scenes tests -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV) $(VENV)-virtualenv $(VENV)-distributed $(VENV)-distributed-virtualenv
+	rm -rf $(VENV) $(VENV)-virtualenv
 	rm -rf $(VENV)-lerobot $(VENV)-lerobot-virtualenv $(VENV)-newest $(VENV)-newest-virtualenv
 	rm -rf $(VENV)-oldest $(VENV)-oldest-virtualenv $(VENV)-uv $(VENV)-uv-virtualenv
 
@@ -222,9 +213,6 @@ $(VENV)/.ready-dev: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 $(VENV)/.ready-agents: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
 	$(call install,$(TORCH) $(WITH_AGENTS) $(TRAINERS))
 	@touch $(VENV)/.ready-demo $(VENV)/.ready-dev
-
-$(VENV)/.ready-distributed: pyproject.toml $(CONSTRAINTS) $(VENV)/.made
-	$(call install,$(TORCH) $(WITH_RAY))
 
 $(VENV)/.ready-lerobot: pyproject.toml $(VENV)/.made
 	$(call install,$(WITH_LEROBOT))

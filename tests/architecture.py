@@ -37,7 +37,7 @@ ORDER = {
     "agents": (
         *("__init__", "record_faces", "learn_from_scratch", "learn_palpate_organs", "learn_retract", "learn_sites"),
         "learn_slide",
-        *("envhub", "lerobot_dataset", "record_demonstrations", "behaviour_cloning", "train_rllib", "leaderboard"),
+        *("envhub", "lerobot_dataset", "record_demonstrations", "behaviour_cloning", "leaderboard"),
     ),
 }
 

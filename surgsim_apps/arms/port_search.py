@@ -40,8 +40,8 @@ WORTHS = 0.1, 0.02, 0.02
 WORTH_LEAST = 0.002
 # Ranges of the two angles and the roll of an arm [rad].
 BOUNDS = [(-ANGLE_MOST, ANGLE_MOST), (-ANGLE_MOST, ANGLE_MOST), (-math.pi, math.pi)]
-# Directions of the endoscope's port along each angle, and least distance between it and an arm [m].
-SCOPE_DIRECTIONS, SCOPE_APART = 15, 0.005
+# Directions of the endoscope's port along each angle.
+SCOPE_DIRECTIONS = 15
 
 
 class PortSearch:

@@ -29,7 +29,6 @@ FEATURES = {
     "agents": "training and scoring of agents (agents/, surgsim evaluate)",
     "bench": "other simulators in `surgsim bench`",
     "demonstrations": "recorded demonstrations (agents/record_demonstrations.py)",
-    "distributed": "training with Ray (agents/train_rllib.py)",
     "docs": "the documentation site (make docs)",
     "live": "the live page (surgsim view)",
     "patient": "label images of scans (surgsim organ)",

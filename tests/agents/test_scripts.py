@@ -21,7 +21,6 @@ ELSEWHERE = {
     "leaderboard": "test_evaluate.py",
     "record_demonstrations": "test_demonstrations.py",
     "record_faces": "test_recorded_faces.py",
-    "train_rllib": "test_rllib.py",
 }
 
 

@@ -15,6 +15,7 @@ NEEDS = {
     "sb3.py": "stable_baselines3",
     "ppo.py": "torch",
     "torchrl_ppo.py": "torchrl",
+    "rllib.py": "ray.rllib",
     "two_arms.py": "supersuit",
 }
 
@@ -53,6 +54,12 @@ def test_torchrl_collects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     names = run("torchrl_ppo.py", tmp_path, monkeypatch)
     # In each batch 32 steps of eight lanes, episodes of 20 steps at most.
     assert len(names["successes"]) >= 16
+
+
+def test_rllib_trains_on_two_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # No cluster answers there: a local Ray is started.
+    monkeypatch.setenv("RAY_ADDRESS", "192.0.2.1:6379")
+    assert run("rllib.py", tmp_path, monkeypatch)["returns"] < 0.0
 
 
 def test_torchrl_makes_one_environment_by_its_id() -> None:

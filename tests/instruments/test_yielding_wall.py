@@ -104,6 +104,44 @@ def test_friction_takes_the_wall_along_as_far_as_it_holds(lever, tmp_path):
     assert wall.stiffness_along * held[2] == pytest.approx(0.3, rel=0.02)
 
 
+def test_a_struck_shaft_gives_the_wall_its_momentum_and_loses_energy_in_its_dampers_alone(lever):
+    """Of arm and wall, about the outer hinge: the servos hold by 1e-3 N m/rad."""
+    wall, step, struck = YieldingWall(friction=0.0), 2e-4, 100
+    arm = load_arm(lever, Port(wall=wall), timestep=step)
+    model, data = arm.model, mujoco.MjData(arm.model)
+    model.opt.gravity[:] = 0.0
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    arm.write(data, arm.home)
+    data.qpos[model.joint(CANNULA).qposadr[0]] = arm.trocar_place(arm.home)
+    mujoco.mj_forward(model, data)
+    hinge, joints = np.array([0.0, 0.0, OUTER]), [model.joint(name).id for name in WALL_JOINTS]
+    stiffness = np.array([wall.stiffness_across, wall.stiffness_across, wall.stiffness_along])
+    rotation, impulse, lost, largest, energies = arm.port.rotation, np.zeros(3), 0.0, 0.0, []
+    for number in range(1500):
+        data.qfrc_applied[:] = 0.0
+        force = np.array([0.5, 0.3, 0.0]) if number < struck else np.zeros(3)
+        tip, stretch = data.site_xpos[arm.tip_site].copy(), data.qpos[model.jnt_qposadr[joints]].copy()
+        body = int(model.site_bodyid[arm.tip_site])
+        mujoco.mj_applyFT(model, data, force, np.zeros(3), tip, body, data.qfrc_applied)
+        mujoco.mj_step(model, data)
+        for refresh in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel, mujoco.mj_subtreeVel):
+            refresh(model, data)
+        mujoco.mj_energyPos(model, data)
+        mujoco.mj_energyVel(model, data)
+        speed = data.qvel[model.jnt_dofadr[joints]]
+        pull = -(stiffness * stretch + wall.damping * speed)
+        impulse += step * (np.cross(rotation @ stretch - hinge, rotation @ pull) + np.cross(tip - hinge, force))
+        lost += step * wall.damping * float(speed @ speed) if number >= struck else 0.0
+        moving = model.body_subtreemass[0] * np.cross(data.subtree_com[0] - hinge, data.subtree_linvel[0])
+        momentum = data.subtree_angmom[0] + moving
+        largest = max(largest, np.abs(momentum).max())
+        np.testing.assert_allclose(momentum, impulse, atol=0.01 * largest)
+        energies.append(data.energy.sum())
+    after = np.array(energies[struck - 1 :])
+    assert (np.diff(after) < 0.0).all() and after[-1] < 1e-6 * after[0]
+    assert lost == pytest.approx(after[0], rel=0.03)
+
+
 def scene_file(folder, arm, wall):
     scene = make_scene("phantom_small")
     scene = replace(scene, instrument=replace(scene.instrument, model=arm))

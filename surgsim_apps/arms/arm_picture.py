@@ -30,8 +30,8 @@ def draw_arm(arm: Arm, joints: ArrayLike) -> NDArray[np.uint8]:
     data = mujoco.MjData(arm.model)
     arm.write(data, joints)
     mujoco.mj_kinematics(arm.model, data)
-    tip, up = arm.tip_pose(joints).position, arm.port.rotation[:, 2]
-    points = np.concatenate([_box_corners(arm.model, data), [arm.trocar, tip]])
+    up = arm.port.rotation[:, 2]
+    points = np.concatenate([_box_corners(arm.model, data), [arm.trocar]])
     aside = np.cross(up, arm.trocar - points.mean(axis=0))
     # Of an arm whose middle is above the trocar every side shows as much.
     length = float(np.linalg.norm(aside))

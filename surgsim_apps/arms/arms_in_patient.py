@@ -35,7 +35,6 @@ class ArmsInPatient:
         evaluation: of both
         arms: left and right
         joints: of each [rad or m]
-        where: what they do, in words
         ports: theirs and the endoscope's
         given: other ports, to show beside them
     """
@@ -43,7 +42,6 @@ class ArmsInPatient:
     evaluation: ArmsEvaluation
     arms: tuple[Arm, ...]
     joints: tuple[FloatArray, ...]
-    where: str
     ports: Ports
     given: Ports | None = None
 
@@ -54,11 +52,11 @@ class ArmsInPatient:
         """Both tips at a point that both reach at once, nearest to the middle of these; without one both at home."""
         rows = np.flatnonzero(both.reachable & ~evaluation.inner)
         if not rows.size:
-            return cls(evaluation, arms, tuple(arm.home for arm in arms), "at home", ports, given)
+            return cls(evaluation, arms, tuple(arm.home for arm in arms), ports, given)
         points = evaluation.points[rows]
         row = rows[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()]
         joints = tuple(values[row] for values in both.joints)
-        return cls(evaluation, arms, joints, "with both tips at one point", ports, given)
+        return cls(evaluation, arms, joints, ports, given)
 
     def scene(self) -> TurningScene:
         """A scene that turns: organ, points in the colours of REACH_KINDS, arms as they are evaluated, ports, wall."""
@@ -94,8 +92,8 @@ class ArmsInPatient:
             for index, kind in enumerate(REACH_KINDS)
         ]
         description = (
-            f"Both arms {self.where}, as the shapes that are evaluated, in the colours of what each reaches alone."
-            + ("" if self.given is None else " Yellow: the given ports.")
+            "Both arms with their tips at a point that both reach, or at home without one, as the shapes that are "
+            "evaluated, in the colours of what each reaches alone. Yellow: given ports, where others are reported."
         )
         return turning_scene(parts, view, description, legend)
 

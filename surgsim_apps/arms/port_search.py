@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -53,9 +54,9 @@ class PortSearch:
     """
 
     def __init__(self, anatomy: Anatomy, quick: QuickReach, ports: Ports) -> None:
-        """Take a scene, the reach of its arms, and ports to begin with, which define wall and target."""
+        """Take a scene, the reach of its arms, and ports to begin with (`on_one_wall`)."""
         self.quick, self._organ = quick, anatomy.mesh.points
-        self.ports = on_one_wall(ports)
+        self.ports = ports
         self._skin = None if ports.wall.skin is None else ports.wall.skin.read()
         line = np.array(ports.right.point) - np.array(ports.left.point)
         self._line = line / np.linalg.norm(line)
@@ -193,17 +194,15 @@ class PortSearch:
         It keeps PORTS_APART from both.
         """
         middle = 0.5 * (np.array(ports.left.point) + np.array(ports.right.point))
-        angles = np.linspace(-ANGLE_MOST, ANGLE_MOST, SCOPE_DIRECTIONS)
         best, chosen = (-1.0, 0.0), ports.endoscope
-        for across in angles:
-            for along in angles:
-                point = self._on_wall(self._direction(np.array([across, along])))
-                if point is None or min(math.dist(point, getattr(ports, side).point) for side in SIDES) < PORTS_APART:
-                    continue
-                # Shares in twentieths: the middle counts where they are alike.
-                key = round(20.0 * self.quick.seen_from(point)) / 20.0, -math.dist(point, middle)
-                if key > best:
-                    best, chosen = key, EndoscopePort(vector(point), vector(self._target))
+        for angles in product(np.linspace(-ANGLE_MOST, ANGLE_MOST, SCOPE_DIRECTIONS), repeat=2):
+            point = self._on_wall(self._direction(np.array(angles)))
+            if point is None or min(math.dist(point, getattr(ports, side).point) for side in SIDES) < PORTS_APART:
+                continue
+            # Shares in twentieths: the middle counts where they are alike.
+            key = round(20.0 * self.quick.seen_from(point)), -math.dist(point, middle)
+            if key > best:
+                best, chosen = key, EndoscopePort(vector(point), vector(self._target))
         return chosen
 
 

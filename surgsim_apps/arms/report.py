@@ -83,8 +83,6 @@ def _search(search: PortsFound | None) -> dict[str, Any] | None:
     return {
         "count": search.count,
         "gains": {side: _per_cent(share) for side, share in search.gains.items()},
-        "given": _per_cent(search.given.share),
-        "best": _per_cent(search.best.share),
         "rows": [
             (
                 name,

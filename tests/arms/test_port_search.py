@@ -76,12 +76,12 @@ def test_quick_reach_is_that_of_the_full_evaluation(anatomy, table):
 
 def test_a_search_finds_ports_from_which_both_reach_all(anatomy, table):
     """The left port 3 cm too far aside; the full evaluation confirms the ports found."""
-    poor = moved(default_ports(anatomy), left=(-0.03, 0.0, 0.0))
-    search = PortSearch(anatomy, quick_reach(anatomy, table, on_one_wall(poor)), poor)
+    poor = on_one_wall(moved(default_ports(anatomy), left=(-0.03, 0.0, 0.0)))
+    search = PortSearch(anatomy, quick_reach(anatomy, table, poor), poor)
     found = search.run(60.0, 0, StepProgress())
     best = found.best.ports
     assert found.given.share < 0.7 and found.best.share >= 0.95
-    assert full(quick_reach(anatomy, table, on_one_wall(poor)), anatomy, table, best)[2].mean() >= 0.95
+    assert full(quick_reach(anatomy, table, poor), anatomy, table, best)[2].mean() >= 0.95
     assert found.gains["left"] > found.given.share
     # On the dome, apart from each other and the organ, within the cone, the left one left.
     target, out = np.array(poor.endoscope.target), np.array(poor.endoscope.point) - poor.endoscope.target
@@ -100,7 +100,7 @@ def test_a_search_finds_ports_from_which_both_reach_all(anatomy, table):
     figures = np.array([[each.share, each.clearance, each.dexterity] for each in found.front])
     for row in figures:
         assert not ((figures >= row).all(axis=1) & (figures > row).any(axis=1)).any() or len(figures) == 1
-    again = PortSearch(anatomy, quick_reach(anatomy, table, on_one_wall(poor)), poor).run(60.0, 0, StepProgress())
+    again = PortSearch(anatomy, quick_reach(anatomy, table, poor), poor).run(60.0, 0, StepProgress())
     assert again == found
 
 

@@ -44,7 +44,6 @@ def write_report(
         ranking_rule=RANKING_RULE,
         number_text=number_text,
         scene=evaluation.turning,
-        poster=maps[0] if maps else None,
         maps=maps,
         colours={**PORT_COLOURS, "both": REACH_KINDS[0].colour},
         has_targets=evaluation.inner.any(),

@@ -86,7 +86,7 @@ def test_every_picture_is_decoded_and_nothing_is_wider_than_the_window(report, s
     browser = shown(report, width)
     made = browser.run(MADE)
     assert browser.complaints() == []
-    assert len(made["images"]) == text.count("<img") == 11
+    assert len(made["images"]) == text.count("<img") == 10
     assert min(made["images"]) >= 60
     assert made["widest"] <= made["window"] == width
     assert made["loaded"] == 0

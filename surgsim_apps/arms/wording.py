@@ -25,7 +25,7 @@ def number_text(value: float, scale: float = 1.0, digits: int | None = 1, unit: 
 def share_text(mask: NDArray[np.bool_]) -> str:
     """A share of points in whole per cent; `<1 %` and `>99 %` instead of none or all by rounding alone."""
     share = 100.0 * float(np.mean(mask)) if len(mask) else 0.0
-    if 0.0 < share < 0.5:
+    if 0.0 < share <= 0.5:
         return "<1 %"
     return ">99 %" if 99.5 <= share < 100.0 else f"{share:.0f} %"
 

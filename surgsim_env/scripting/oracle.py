@@ -326,10 +326,11 @@ def retraction_steps(
         return flap_steps(simulation, target, turning_size, enough, aside=aside, share=lift)
     rest, nodes = simulation.organ_model.node_rest_position, simulation.organ_state.node_position
     depth = float(rest[:, 1].max())
-    edge = rest[:, 1] > depth - 1e-6
     along = float(target[0]) + aside
-    near = edge & (np.abs(rest[:, 0] - along) <= GRASP_DEPTH)
-    _, border, height = nodes[near].mean(axis=0).tolist()
+    near = np.abs(rest[:, 0] - along) <= GRASP_DEPTH
+    border = float(nodes[near & (rest[:, 1] > depth - 1e-6), 1].mean())
+    # The edge hangs lower than the tissue between the pads.
+    height = float(nodes[near & (rest[:, 1] >= depth - 2.0 * GRASP_DEPTH), 2].mean())
     # Largest reach along y of the supports that end before the edge [m].
     supports = simulation.anatomy.scene.supports
     reaches = (support.reach(OUTWARD) for support in supports if support.kind != "plane")

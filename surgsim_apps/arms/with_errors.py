@@ -21,10 +21,10 @@ def evaluate_errors(reach: Reach, sites: Sites, around: Obstacles, seed: int) ->
     if errors is None or not rows.size:
         return None
     joints, rng = reach.report.joints[rows], np.random.default_rng(seed)
-    offset, play, _ = errors.of(kinematics.hinge[: joints.shape[1]])
-    shape = (DRAWS, *joints.shape)
-    deviation = offset * rng.uniform(-1.0, 1.0, (DRAWS, 1, joints.shape[1])) + play * rng.uniform(-1.0, 1.0, shape)
-    chain = kinematics.at((joints + deviation).reshape(-1, joints.shape[1]))
+    count = joints.shape[1]
+    offset = errors.offset * rng.uniform(-1.0, 1.0, (DRAWS, 1, count))
+    play = errors.play * rng.uniform(-1.0, 1.0, (DRAWS, *joints.shape))
+    chain = kinematics.at((joints + offset + play).reshape(-1, count))
     shift = chain.tip.reshape(DRAWS, -1, 3) - kinematics.at(joints, shapes=False).tip
     clear = around.clears_organ(kinematics, chain) | np.tile(sites.inner[rows], DRAWS)
     clear &= (around.wall_clearance(kinematics, chain) >= 0.0) & around.clears_others(kinematics, chain.shape_ends)

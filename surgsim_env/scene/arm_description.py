@@ -4,10 +4,6 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from msdm_core.mesh.tet_mesh import FloatArray
 from surgsim_env.scene.load import fill, list_arms, nearest, read_toml, require_known, scenes_folder
 from surgsim_env.scene.model import Taxels, Vector, require_direction, require_number
 
@@ -100,30 +96,17 @@ class JointControl:
 
 @dataclass(frozen=True)
 class JointErrors:
-    """Errors of joints whose encoders sit at the motors, behind cables, of hinges [rad] and of slides [m].
+    """Errors of joints whose encoders sit at the motors, behind cables; one number a joint.
 
     Args:
-        turn_offset, slide_offset: largest constant error; each episode draws one for each joint from [-offset, offset].
-        turn_play, slide_play: half the width of the loop of a joint that turns back.
-        turn_drift, slide_drift: largest rate of an offset [rad/s], [m/s], drawn likewise.
+        offset: largest constant error [rad or m]; each episode draws one from [-offset, offset].
+        play: half the width of the loop of a joint that turns back [rad or m].
+        drift: largest rate of the offset [rad/s or m/s], drawn likewise.
     """
 
-    turn_offset: float = 0.0
-    slide_offset: float = 0.0
-    turn_play: float = 0.0
-    slide_play: float = 0.0
-    turn_drift: float = 0.0
-    slide_drift: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            unit = ("rad" if name.startswith("turn") else "m") + ("/s" if name.endswith("drift") else "")
-            require_number(f"joint_errors.{name}", value, 0.0, unit)
-
-    def of(self, hinges: NDArray[np.bool_]) -> FloatArray:
-        """Largest offset, play and largest drift of joints, by a mask of hinges (n,), as (3, n)."""
-        turn, slide = np.array(list(vars(self).values())).reshape(3, 2).T[:, :, None]
-        return np.where(hinges, turn, slide)
+    offset: tuple[float, ...]
+    play: tuple[float, ...]
+    drift: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -220,6 +203,13 @@ class ArmDescription:
         _require_distinct("joints, jaw and held", (*self.joints, *self.jaw, *self.held))
         self._check_control()
         self._check_home()
+        if self.joint_errors is not None:
+            for name, values in vars(self.joint_errors).items():
+                if len(values) != len(self.joints) or not all(0.0 <= value < math.inf for value in values):
+                    raise ValueError(
+                        f"joint_errors.{name} is {list(values)} for {len(self.joints)} joints; the rule is a finite "
+                        "number from 0 on for each"
+                    )
 
     def _check_control(self) -> None:
         control = self.control

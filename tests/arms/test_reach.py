@@ -82,7 +82,8 @@ def test_errors_of_the_joints_at_the_points_in_reach(tmp_path):
         return evaluate_errors(reach, sites, around(), seed=0)
 
     assert effect(None) is None
-    exact, moved = effect(JointErrors()), effect(JointErrors(slide_offset=0.002))
+    none = (0.0,) * 3
+    exact, moved = effect(JointErrors(none, none, none)), effect(JointErrors((0.0, 0.0, 0.002), none, none))
     assert exact.tip_error.shape == (DRAWS, 2) and exact.tip_error.max() == 0.0 and exact.kept == 1.0
     assert 1e-4 < moved.tip_error.max() <= 0.002 and moved.kept == 1.0
     np.testing.assert_allclose(moved.tip_error[:, 0], moved.tip_error[:, 1], atol=1e-9)
@@ -90,7 +91,7 @@ def test_errors_of_the_joints_at_the_points_in_reach(tmp_path):
     np.testing.assert_allclose(
         moved.depth_error / moved.tip_error, np.tile(-sites.points[:2, 2] / depth, (DRAWS, 1)), rtol=1e-6
     )
-    turned = effect(JointErrors(turn_play=0.01)).tip_error
+    turned = effect(JointErrors(none, (0.01, 0.01, 0.0), none)).tip_error
     assert turned[:, 0].std() > 1e-5 and (turned <= 0.02 * depth).all()
 
 

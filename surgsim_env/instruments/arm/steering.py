@@ -81,8 +81,7 @@ class SteeredArm:
         instrument.servo.lower[places], instrument.servo.upper[places] = arm.lower, arm.upper
         self._tip = model.site(prefix + arm.model.site(arm.tip_site).name).id
         self._velocity = np.zeros(6)
-        hinges = np.array([arm.model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE for name in arm.joints])
-        self.deviation = JointDeviation(arm.description.joint_errors if joint_errors else None, hinges)
+        self.deviation = JointDeviation(arm.description.joint_errors if joint_errors else None)
         wall = arm.port.wall
         self._wall = None if wall is None else [model.joint(prefix + name).id for name in WALL_JOINTS]
         self._cannula = None if wall is None else int(model.joint(prefix + CANNULA).qposadr[0])
@@ -103,9 +102,11 @@ class SteeredArm:
     @property
     def tip_reading(self) -> FloatArray:
         """Position of the tip by the joints' encoders [m], (3,); of exact joints `tip_position`."""
-        if self.deviation.exact:
+        if self.deviation.errors is None:
             return self.tip_position
-        return self.arm.tip_pose(self.joint_positions - self.deviation.value).position
+        targets, time = self._targets, self._instrument.data.time
+        encoders = self.joint_positions - targets + self.deviation.encoders(targets, time)
+        return self.arm.tip_pose(encoders).position
 
     @property
     def tip_rotation(self) -> FloatArray:
@@ -123,6 +124,11 @@ class SteeredArm:
     def joint_positions(self) -> FloatArray:
         """Values of the driven joints [rad or m], (n,)."""
         return self._instrument.data.qpos[self._qpos[: self.arm.joint_count]]
+
+    @property
+    def _targets(self) -> FloatArray:
+        """Targets of the driven joints' servos [rad or m], (n,)."""
+        return self._instrument.data.ctrl[self._instrument.servo.position[self._places]]
 
     @property
     def trocar_residual(self) -> float:
@@ -165,7 +171,7 @@ class SteeredArm:
         data.qpos[self._qpos] = np.append(solution.joints, self.arm.followers.values(solution.joints))
         data.ctrl[servo.position[self._places]] = solution.joints
         servo.command[self._places] = 0.0
-        self.deviation.begin(solution.joints)
+        self.deviation.begin(solution.joints, data.time)
         if self._cannula is not None:
             data.qpos[self._cannula] = self.arm.trocar_place(solution.joints)
         if self.jaw is not None:
@@ -181,9 +187,9 @@ class SteeredArm:
         Valid for one control step; after it the joints continue at the same speeds.
         """
         duration, servo = self._control_step, self._instrument.servo
-        targets = self._instrument.data.ctrl[servo.position[self._places]]
-        joints = targets - self.deviation.value
-        if not np.isfinite(joints).all():
+        targets, time = self._targets, self._instrument.data.time
+        joints = self.deviation.encoders(targets, time)
+        if not np.isfinite(targets).all():
             # MuJoCo's own warning ends the episode.
             servo.command[self._places] = 0.0
             return
@@ -194,12 +200,12 @@ class SteeredArm:
         held = np.clip(target, self.lower, self.upper)
         if not np.any(velocity) and self._points_well(joints, pose.rotation):
             self.short = False
-            servo.command[self._places] = (self.deviation.follow(joints, duration) - targets) / duration
-            return
-        direction, frame = (None, self.goal) if self.goal.ndim == 2 else (self.goal, None)
-        step = follow(self.arm, joints, held, direction, duration, rotation=frame)
-        self.short = step.limited or bool((held != target).any())
-        servo.command[self._places] = (self.deviation.follow(step.joints, duration) - targets) / duration
+        else:
+            direction, frame = (None, self.goal) if self.goal.ndim == 2 else (self.goal, None)
+            step = follow(self.arm, joints, held, direction, duration, rotation=frame)
+            self.short, joints = step.limited or bool((held != target).any()), step.joints
+        goal = self.deviation.follow(targets, joints, duration, time)
+        servo.command[self._places] = (goal - targets) / duration
 
     def command_jaw(self, target: float) -> None:
         """Command the jaw to a target from -1 (closed) to 1 (open), approached at limited speed and held.

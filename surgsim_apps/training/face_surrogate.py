@@ -32,7 +32,7 @@ class FormulaTip:
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
-    tip_position: NDArray[np.float64]
+    tip_reading: NDArray[np.float64]
     tip_velocity: NDArray[np.float64]
     contact_force: NDArray[np.float64]
     contact_centre: NDArray[np.float64] | None = None
@@ -93,8 +93,8 @@ class FaceSurrogate:
         for index in np.flatnonzero(~self.over):
             env, tip, action = self.envs[index], self.tips[index], np.asarray(actions[index], dtype=np.float64)
             env.runtime.begin(action, tip)
-            tip.tip_position = np.clip(
-                tip.tip_position + tip.tip_velocity * env.scene.timing.control_step, tip.lower, tip.upper
+            tip.tip_reading = np.clip(
+                tip.tip_reading + tip.tip_velocity * env.scene.timing.control_step, tip.lower, tip.upper
             )
             self._press(index)
             self._observations[index] = self._observe(index)
@@ -112,8 +112,8 @@ class FaceSurrogate:
     def _press(self, index: int) -> None:
         """Set the force and the touched point of a tip."""
         task, tip = self.envs[index].task, self.tips[index]
-        surface, normal = task.anatomy.face.project(tip.tip_position)
-        depth = task.charted.tip_radius - float((tip.tip_position - surface) @ normal)
+        surface, normal = task.anatomy.face.project(tip.tip_reading)
+        depth = task.charted.tip_radius - float((tip.tip_reading - surface) @ normal)
         tip.contact_centre = surface if depth > 0.0 else None
         bump = self.excess[index] * np.exp(-0.5 * ((surface - self.truth[index]) ** 2).sum() / self.width[index] ** 2)
         field = 1.0 + self.amplitude[index] @ np.sin(self.wave[index] @ surface + self.phase[index])

@@ -186,14 +186,14 @@ def test_the_surrogate_presses_as_the_organ_does():
     made.reset()
     env = made.envs[0]
     observation, _ = env.reset(seed=700_003)
-    made.tips[0].tip_position = env.simulation.instrument.tip_position.copy()
+    made.tips[0].tip_reading = env.simulation.instrument.tip_position.copy()
     made.excess[0], made.amplitude[0], made.stiffness[0] = 0.0, 0.0, 1.5
     down = np.array([0.0, 0.0, -0.5, 0.0], dtype=np.float32)
     while observation[FACE["tip_depth"]][0] < 0.35:
         observation, *_ = env.step(down)
     # The task is shared: the surrogate's step looks at its own tip.
     organ = {name: observation[FACE[name]].copy() for name in ("tip_depth", "face_force", "surface_normal")}
-    made.tips[0].tip_position = env.simulation.instrument.tip_position.copy()
+    made.tips[0].tip_reading = env.simulation.instrument.tip_position.copy()
     formula = made.step(np.zeros((1, 4)))[0]
     assert formula[FACE["tip_depth"]] == pytest.approx(organ["tip_depth"], abs=1e-4)
     np.testing.assert_allclose(formula[FACE["surface_normal"]], organ["surface_normal"], atol=1e-4)

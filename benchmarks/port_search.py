@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
@@ -67,15 +68,19 @@ def main() -> None:
             given = on_one_wall(default_ports(anatomy))
             left, right = (read_description(arm) for arm in (options.left, options.right))
             setup = ArmSetup(name, "", left, right, given)
-            tables = make_tables(setup, anatomy.scene.instrument.tip_radius)
+            choices = make_tables(setup, anatomy.scene.instrument.tip_radius, shifted=True)
+            tables = {side: row[0] for side, row in choices.items()}
             sites = find_sites(anatomy, given, SEARCH_POINTS, 0)
-            search = PortSearch(anatomy, QuickReach(anatomy, tables, Obstacles.of(anatomy, given), sites), given)
+            quick = QuickReach(anatomy, tables, Obstacles.of(anatomy, given), sites)
+            search = PortSearch(anatomy, quick, given, choices)
             began = time.monotonic()
             found = [search.run(options.seconds, seed, StepProgress()) for seed in range(options.seeds)]
             taken = (time.monotonic() - began) / options.seeds
+            search.quick.tables = tables
+            setups = setup, replace(setup, ports=found[0].best.ports, **found[0].arms)
             exact = [
-                evaluate_arms(anatomy, left, right, ports, faced=given, count=EXACT_POINTS).both.mean()
-                for ports in (given, found[0].best.ports)
+                evaluate_arms(anatomy, each.left, each.right, each.ports, faced=given, count=EXACT_POINTS).both.mean()
+                for each in setups
             ]
             shares = [f"{100 * each.best.share:.0f}" for each in found]
             shown.add_row(

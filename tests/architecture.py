@@ -35,7 +35,7 @@ ORDER = {
     ),
     # One script each.
     "agents": (
-        *("__init__", "record_faces", "learn_from_scratch", "learn_palpate_organs", "learn_retract", "learn_sites"),
+        *("__init__", "record_faces", "learn_palpate_organs", "learn_retract", "learn_sites"),
         "learn_slide",
         *("envhub", "lerobot_dataset", "record_demonstrations", "behaviour_cloning", "leaderboard"),
     ),

@@ -4,6 +4,8 @@ Both are made once for many placements. After Zacharias, Borst & Hirzinger 2007,
 representing robot capabilities".
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
@@ -13,13 +15,15 @@ from surgsim_apps.arms.clearance import segment_triangle_distance
 from surgsim_apps.arms.joint_search import approach_directions, from_directions, from_starts, spread_starts
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.reach import tip_ball
-from surgsim_env.instruments import load_arm
+from surgsim_env.instruments import load_arm, solve_pose
 from surgsim_env.scene import ArmDescription, Port
 
 # Grid of the tip's places: spacing, least and greatest distance from the trocar [m], least cosine from the port's axis.
 SPACING, NEAREST, FURTHEST, CONE = 0.06, 0.03, 0.30, 0.3
 # Ways to each place that are kept.
 WAYS = 12
+# Shift of an arm's base along its table [m].
+BASE_SHIFT = 0.1
 # Spacing of the organ's distances [m], and number of spacings within which they are exact.
 FIELD_SPACING, NEAR_SPACINGS = 0.005, 4
 
@@ -72,6 +76,24 @@ class Capability:
         nearest = np.asarray(self._places.query(tips)[1])
         order = np.argsort(np.einsum("nki,ni->nk", self._pointing[nearest], normals), axis=1)[:, :count]
         return self._joints[nearest[:, None], order]
+
+
+def shifted_bases(description: ArmDescription) -> list[ArmDescription]:
+    """An arm with its base BASE_SHIFT beside its place along x and y of its model's frame, each with a home.
+
+    Empty where the mechanism holds the shaft in the trocar.
+    """
+    arm, trocar = load_arm(description), description.trocar
+    shifts = np.eye(3)[:2] * BASE_SHIFT if not arm.remote_centre_fixed else np.zeros((0, 3))
+    tip, shifted = arm.tip_pose(arm.home).position, []
+    for shift in np.concatenate([shifts, -shifts]):
+        arm.trocar = shift @ Port(into=trocar.into).rotation
+        home = solve_pose(arm, tip + arm.trocar)
+        if home.reached:
+            x, y, z = (np.array(trocar.point) + shift).tolist()
+            joints = dict(zip(arm.joints, home.joints.tolist(), strict=True))
+            shifted.append(replace(description, trocar=replace(trocar, point=(x, y, z)), home=joints))
+    return shifted
 
 
 class DistanceField:

@@ -1,4 +1,4 @@
-"""Search for the ports of two arms and the endoscope on a body wall.
+"""Search for the ports of two arms and the endoscope on a body wall, and for the places of the arms' bases.
 
 Ports of each arm alone are sampled; the pairs with the most points in common begin a differential evolution (Storn &
 Price 1997) of two angles and a roll for each arm. The endoscope follows.
@@ -6,7 +6,7 @@ Price 1997) of two angles and a roll for each arm. The endoscope follows.
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -17,6 +17,7 @@ from scipy.optimize import differential_evolution
 from scipy.stats import qmc
 
 from msdm_core.mesh import FloatArray, IntArray
+from surgsim_apps.arms.capability import Capability
 from surgsim_apps.arms.kinematics import cross, dot
 from surgsim_apps.arms.ports import EndoscopePort, PortPlace, Ports, vector
 from surgsim_apps.arms.quick_reach import CLEARANCE_MOST, PlacementFigures, QuickReach
@@ -53,9 +54,12 @@ class PortSearch:
         quick: reach of the arms
     """
 
-    def __init__(self, anatomy: Anatomy, quick: QuickReach, ports: Ports) -> None:
-        """Take a scene, the reach of its arms, and ports to begin with (`on_one_wall`)."""
+    def __init__(
+        self, anatomy: Anatomy, quick: QuickReach, ports: Ports, tables: Mapping[str, Sequence[Capability]]
+    ) -> None:
+        """Take a scene, the reach of its arms, ports to begin with (`on_one_wall`), and each arm's bases by side."""
         self.quick, self._organ = quick, anatomy.mesh.points
+        self._given, self._tables = quick.tables, tables
         self.ports = ports
         self._skin = None if ports.wall.skin is None else ports.wall.skin.read()
         line = np.array(ports.right.point) - np.array(ports.left.point)
@@ -91,18 +95,40 @@ class PortSearch:
             best_worth, waited = best if better else best_worth, 0 if better else waited + 1
             return time.monotonic() > end or waited >= PATIENCE
 
+        self.quick.tables = self._given
+        (given,) = _placements([self.ports], self.quick.evaluate([self.ports]))
         with progress.step(f"searching ports for at most {seconds:g} s") as advance:
+            self.quick.tables = {side: self._best_base(number, seed) for number, side in enumerate(SIDES)}
             begin: Any = self._begin(seed, 0.5 * seconds)
             differential_evolution(
                 losses, BOUNDS * 2, init=begin, vectorized=True, updating="deferred", tol=0.0, maxiter=10**6,
                 polish=False, callback=over, rng=seed,
             )  # fmt: skip
-        (given,) = _placements([self.ports], self.quick.evaluate([self.ports]))
-        best = tried[int(np.argmax(worths))]
-        swapped = [replace(self.ports, **{side: getattr(best.ports, side)}) for side in SIDES]
-        gains: dict[str, float] = dict(zip(SIDES, self.quick.evaluate(swapped).share.tolist(), strict=True))
+        best, chosen, gains = tried[int(np.argmax(worths))], self.quick.tables, {}
+        for side in SIDES:
+            self.quick.tables = {**self._given, side: chosen[side]}
+            swapped = replace(self.ports, **{side: getattr(best.ports, side)})
+            gains[side] = float(self.quick.evaluate([swapped]).share[0])
+        self.quick.tables = chosen
         seen = replace(best, ports=replace(best.ports, endoscope=self._endoscope(best.ports)))
-        return PortsFound(given, seen, _front([given, *tried]), gains, len(tried))
+        moved = [side for side in SIDES if chosen[side] is not self._given[side]]
+        arms = {side: chosen[side].kinematics.arm.description for side in moved}
+        return PortsFound(given, seen, _front([given, *tried]), gains, len(tried), arms)
+
+    def _sampled(self, number: int, seed: int) -> tuple[FloatArray, dict[int, PortPlace]]:
+        """Numbers of the sampled ports of an arm (ALONE, 3), and the places of those on the wall by row."""
+        low, high = np.transpose(BOUNDS)
+        sampled = low + (high - low) * qmc.Sobol(3, rng=np.random.default_rng([seed, number])).random(ALONE)
+        return sampled, {row: place for row, values in enumerate(sampled) if (place := self._place(values)) is not None}
+
+    def _best_base(self, number: int, seed: int) -> Capability:
+        """Table of the base from which an arm reaches most at the best quarter of a few sampled ports."""
+        side, reached = SIDES[number], []
+        ports = [place.port for place in self._sampled(number, seed)[1].values()][:ALONE_AT_ONCE]
+        for table in self._tables[side] if len(self._tables[side]) > 1 else ():
+            self.quick.tables = {side: table}
+            reached.append(np.sort(self.quick.alone(side, ports).sum(axis=1))[-(len(ports) // 4) :].sum())
+        return self._tables[side][int(np.argmax(reached)) if reached else 0]
 
     def _begin(self, seed: int, seconds: float) -> FloatArray:
         """The given ports, and pairs of sampled ones with the most points that each arm of the pair reaches alone.
@@ -110,11 +136,10 @@ class PortSearch:
         Returns:
             Numbers of the first generation (GENERATION, 6).
         """
-        end, low, high = time.monotonic() + seconds, *np.transpose(BOUNDS)
+        end, (low, high) = time.monotonic() + seconds, np.transpose(BOUNDS)
         values, points, masks = [], [], []
         for number, side in enumerate(SIDES):
-            sampled = low + (high - low) * qmc.Sobol(3, rng=np.random.default_rng([seed, number])).random(ALONE)
-            kept = {index: place for index, row in enumerate(sampled) if (place := self._place(row)) is not None}
+            sampled, kept = self._sampled(number, seed)
             chosen, reached = [*kept], []
             for first in range(0, len(chosen), ALONE_AT_ONCE):
                 reached.append(

@@ -75,15 +75,13 @@ class QuickReach:
 
     Fields:
         sites: the points, with the organ at rest
+        tables: of each arm, by side
     """
 
-    def __init__(
-        self, anatomy: Anatomy, capabilities: Mapping[str, Capability], around: Obstacles, sites: Sites
-    ) -> None:
+    def __init__(self, anatomy: Anatomy, tables: Mapping[str, Capability], around: Obstacles, sites: Sites) -> None:
         """Take a scene, each arm's table by side, the obstacles and points of the organ."""
-        self.sites = sites
-        self._capabilities, self._around = capabilities, around
-        margin = WORKING_ZONE + max(table.kinematics.arm.shape_radius.max() for table in capabilities.values())
+        self.sites, self.tables, self._around = sites, tables, around
+        margin = WORKING_ZONE + max(table.kinematics.arm.shape_radius.max() for table in tables.values())
         triangles = anatomy.mesh.boundary_triangles
         # A breath is taken at rest and at the tops of its motions.
         self._positions = [
@@ -103,7 +101,7 @@ class QuickReach:
             masks &= np.stack([*(ways.usable.any(axis=1) for ways in arms), both]).reshape(3, *shape)
             rows = np.flatnonzero(both)
             for side, ways, way in zip(SIDES, arms, pair, strict=True):
-                chosen, kinematics = rows * ways.usable.shape[1] + way[rows], self._capabilities[side].kinematics
+                chosen, kinematics = rows * ways.usable.shape[1] + way[rows], self.tables[side].kinematics
                 values = isotropy(scaled_singular_values(kinematics, ways.chain.only(chosen)))
                 np.minimum.at(isotropies.reshape(-1), rows, values)
                 np.minimum.at(gaps.reshape(-1), rows, np.minimum(ways.gap[chosen], apart[rows]))
@@ -129,7 +127,7 @@ class QuickReach:
 
     def _ways(self, side: str, ports: Sequence[Port], sites: Sites, field: DistanceField) -> _Ways:
         """Ways of one arm at ports to all points."""
-        table, count = self._capabilities[side], len(sites.points)
+        table, count = self.tables[side], len(sites.points)
         kinematics = table.kinematics
         trocars, turns = np.array([port.point for port in ports]), np.array([port.rotation for port in ports])
         # Rows of a matrix times the frame's axes as columns: components in the port's frame.
@@ -162,7 +160,7 @@ class QuickReach:
             if not rows.size:
                 continue
             left, right = (
-                (self._capabilities[side].kinematics, arm.chain.only(rows * arm.usable.shape[1] + way))
+                (self.tables[side].kinematics, arm.chain.only(rows * arm.usable.shape[1] + way))
                 for side, arm, way in zip(SIDES, arms, ways, strict=True)
             )
             distance = np.minimum(*arm_distances(left, right, points[rows], CLEARANCE_MOST))

@@ -81,6 +81,7 @@ def _search(search: PortsFound | None) -> dict[str, Any] | None:
     rows += [(f"front {number}", placement) for number, placement in enumerate(search.front, start=1)]
     return {
         "count": search.count,
+        "bases": [*search.arms],
         "gains": {side: _per_cent(share) for side, share in search.gains.items()},
         "rows": [
             (

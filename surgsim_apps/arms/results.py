@@ -10,7 +10,7 @@ from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.arms.ports import Ports
 from surgsim_apps.reports.turning_scene import TurningScene
 from surgsim_env.instruments import SIDES
-from surgsim_env.scene import Port
+from surgsim_env.scene import ArmDescription, Port
 
 # Reasons why an arm does not reach a point, in the order of the tests; 0 is reachable.
 REASONS = ("reachable", "no joints put the tip there", "a joint limit", "the shaft misses its trocar",
@@ -176,6 +176,7 @@ class PortsFound:
         front: no placement of the search is better in one figure and not worse in the others; most reach first
         gains: share of the points that both reach, with one port moved from given to best, by side
         count: number of placements tried
+        arms: whose bases stand elsewhere in best, by side
     """
 
     given: Placement
@@ -183,6 +184,7 @@ class PortsFound:
     front: tuple[Placement, ...]
     gains: dict[str, float]
     count: int
+    arms: dict[str, ArmDescription]
 
 
 @dataclass(frozen=True)

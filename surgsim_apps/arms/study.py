@@ -10,7 +10,7 @@ from rich.console import Console
 
 from msdm_core.mesh import FloatArray
 from surgsim_apps.arms.arms_in_patient import ArmsInPatient
-from surgsim_apps.arms.capability import Capability, quartered
+from surgsim_apps.arms.capability import Capability, quartered, shifted_bases
 from surgsim_apps.arms.clearance import Obstacles
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.pictures import ArmMaps, camera_view
@@ -28,7 +28,7 @@ from surgsim_apps.arms.reach import (
     tip_ball,
 )
 from surgsim_apps.arms.report import write_report
-from surgsim_apps.arms.results import ArmsEvaluation, PortsFound
+from surgsim_apps.arms.results import ArmsEvaluation
 from surgsim_apps.arms.through_cycle import evaluate_cycle
 from surgsim_apps.arms.with_errors import evaluate_errors
 from surgsim_apps.arms.wording import verdict
@@ -46,6 +46,7 @@ FOUND_NAME, PLACEMENTS_NAME = "ports.toml", "placements.csv"
 # All possible files of a study.
 RESULT_NAMES = (
     *(REPORT_NAME, POINTS_NAME, FOUND_NAME, PLACEMENTS_NAME, "map_reach.png"),
+    *(f"{side}.toml" for side in SIDES),
     *(f"map_{quantity.field}.png" for quantity in QUANTITIES),
 )
 
@@ -238,11 +239,16 @@ def run_study(
     evaluations, given, found = [], setups[0], None
     with StepProgress(console) as progress:
         with progress.step("tables of what each arm reaches"):
-            tables = make_tables(given, anatomy.scene.instrument.tip_radius)
+            choices = make_tables(given, anatomy.scene.instrument.tip_radius, shifted=search_seconds is not None)
+        tables: Mapping[str, Capability] = {side: row[0] for side, row in choices.items()}
         if search_seconds is not None:
-            found = _search(given, anatomy, tables, search_seconds, seed, progress)
+            sites = find_sites(anatomy, given.ports, SEARCH_POINTS, seed)
+            ports = on_one_wall(given.ports)
+            quick = QuickReach(anatomy, tables, Obstacles.of(anatomy, ports), sites)
+            found = PortSearch(anatomy, quick, ports, choices).run(search_seconds, seed, progress)
+            tables = quick.tables
             what = f"ports found, {given.left.name} left, {given.right.name} right"
-            setups = [replace(given, name=FOUND_NAME, what=what, ports=found.best.ports), *setups]
+            setups = [replace(given, name=FOUND_NAME, what=what, ports=found.best.ports, **found.arms), *setups]
         for setup in setups:
             progress.say(f"{setup.name}: {setup.what}")
             evaluations.append(
@@ -274,25 +280,18 @@ def run_study(
         write_placements(found, folder / PLACEMENTS_NAME)
         (folder / FOUND_NAME).write_text(as_toml(found.best.ports), encoding="utf-8", newline="\n")
         names += [FOUND_NAME, PLACEMENTS_NAME]
+        for side, arm in found.arms.items():
+            names.append(f"{side}.toml")
+            moved = replace(arm, model=str((arm.folder / arm.model).resolve()))
+            (folder / names[-1]).write_text(as_toml(moved), encoding="utf-8", newline="\n")
     return names
 
 
-def make_tables(setup: ArmSetup, tip_radius: float) -> dict[str, Capability]:
-    """Tables of both arms; of equal arms one."""
-    left = Capability(setup.left, tip_radius)
-    return {"left": left, "right": left if setup.right == setup.left else Capability(setup.right, tip_radius)}
+def make_tables(setup: ArmSetup, tip_radius: float, *, shifted: bool) -> dict[str, list[Capability]]:
+    """Tables of both arms, of equal arms the same ones, with those of their `shifted_bases`."""
 
+    def tables(arm: ArmDescription) -> list[Capability]:
+        return [Capability(each, tip_radius) for each in (arm, *(shifted_bases(arm) if shifted else ()))]
 
-def _search(
-    setup: ArmSetup,
-    anatomy: Anatomy,
-    tables: Mapping[str, Capability],
-    seconds: float,
-    seed: int,
-    progress: StepProgress,
-) -> PortsFound:
-    """Search for better ports of a setup."""
-    sites = find_sites(anatomy, setup.ports, SEARCH_POINTS, seed)
-    ports = on_one_wall(setup.ports)
-    quick = QuickReach(anatomy, tables, Obstacles.of(anatomy, ports), sites)
-    return PortSearch(anatomy, quick, ports).run(seconds, seed, progress)
+    left = tables(setup.left)
+    return {"left": left, "right": left if setup.right == setup.left else tables(setup.right)}

@@ -13,7 +13,6 @@ AGENTS = ROOT / "agents"
 # Scripts that other tests run.
 ELSEWHERE = {
     "behaviour_cloning": "test_demonstrations.py",
-    "learn_from_scratch": "test_from_scratch.py",
     "learn_palpate_organs": "test_organ_agents.py",
     "learn_retract": "test_retract_agents.py",
     "learn_sites": "test_learn_sites.py",

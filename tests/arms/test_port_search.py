@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgsim_apps.arms.capability import Capability, DistanceField
+from surgsim_apps.arms.capability import BASE_SHIFT, Capability, DistanceField, shifted_bases
 from surgsim_apps.arms.clearance import Obstacles, wall_clearance
 from surgsim_apps.arms.kinematics import BatchKinematics
 from surgsim_apps.arms.port_search import ANGLE_MOST, ORGAN_APART, PORTS_APART, PortSearch, on_one_wall
@@ -17,9 +17,9 @@ from surgsim_apps.arms.results import REASONS
 from surgsim_apps.arms.study import find_sites
 from surgsim_apps.reports.surface_drawing import tube
 from surgsim_env.instruments import SIDES, load_arm
-from surgsim_env.scene import CyclicMotion, Port, as_toml, load_anatomy, make_scene
+from surgsim_env.scene import CyclicMotion, Port, as_toml, load_anatomy, make_scene, read_description
 from surgsim_env.step_progress import StepProgress
-from tests.arms.pivot_arm import pivot
+from tests.arms.pivot_arm import FAR, MODEL, NEAR, SITE, pivot, write_pivot
 
 COUNT = 24
 
@@ -77,7 +77,8 @@ def test_quick_reach_is_that_of_the_full_evaluation(anatomy, table):
 def test_a_search_finds_ports_from_which_both_reach_all(anatomy, table):
     """The left port 3 cm too far aside; the full evaluation confirms the ports found."""
     poor = on_one_wall(moved(default_ports(anatomy), left=(-0.03, 0.0, 0.0)))
-    search = PortSearch(anatomy, quick_reach(anatomy, table, poor), poor)
+    quick = quick_reach(anatomy, table, poor)
+    search = PortSearch(anatomy, quick, poor, dict.fromkeys(SIDES, (table,)))
     found = search.run(60.0, 0, StepProgress())
     best = found.best.ports
     assert found.given.share < 0.7 and found.best.share >= 0.95
@@ -100,8 +101,35 @@ def test_a_search_finds_ports_from_which_both_reach_all(anatomy, table):
     figures = np.array([[each.share, each.clearance, each.dexterity] for each in found.front])
     for row in figures:
         assert not ((figures >= row).all(axis=1) & (figures > row).any(axis=1)).any() or len(figures) == 1
-    again = PortSearch(anatomy, quick_reach(anatomy, table, poor), poor).run(60.0, 0, StepProgress())
-    assert again == found
+    assert search.run(60.0, 0, StepProgress()) == found
+
+
+def test_a_search_puts_the_base_where_the_arm_reaches_more(anatomy, table, tmp_path):
+    """Tables of a slide that ends at 12 cm and of one that ends at 20 cm; the given ports keep the first."""
+    model = MODEL.replace(f'range="{NEAR} {FAR}"', f'range="{NEAR} 0.12"')
+    short = read_description(write_pivot(tmp_path, model=model, sites=SITE))
+    usual, short_table = on_one_wall(default_ports(anatomy)), Capability(short, 0.004)
+    quick = quick_reach(anatomy, short_table, usual)
+    share = quick.evaluate([usual]).share[0]
+    search = PortSearch(anatomy, quick, usual, {"left": (short_table, table), "right": (table, short_table)})
+    found = search.run(5.0, 0, StepProgress())
+    assert found.given.share == share
+    assert quick.tables == dict.fromkeys(SIDES, table)
+    assert found.arms == dict.fromkeys(SIDES, table.kinematics.arm.description)
+
+
+def test_bases_beside_their_place_keep_the_shaft_in_the_trocar():
+    """`load_arm` refuses a home that misses the trocar; the base of a mechanism with a remote centre stays."""
+    arm = read_description("six_axis")
+    bases = shifted_bases(arm)
+    shifts = [np.array(base.trocar.point) - arm.trocar.point for base in bases]
+    axes = BASE_SHIFT * np.eye(3)[:2]
+    assert np.array(shifts) == pytest.approx(np.concatenate([axes, -axes]), abs=1e-12)
+    depth = -load_arm(arm).tip_pose(load_arm(arm).home).position[2]
+    for base in bases:
+        # The tip is as far past its trocar as it was.
+        assert load_arm(base).tip_pose(load_arm(base).home).position == pytest.approx([0.0, 0.0, -depth], abs=1e-6)
+    assert shifted_bases(read_description("psm_grasper")) == []
 
 
 def test_ports_found_are_read_from_their_file_as_they_were(anatomy, tmp_path):
@@ -160,7 +188,9 @@ def skin_file(tmp_path, anatomy):
 def test_ports_lie_on_a_skin(anatomy, table, skin_file):
     wall = Wall(skin=SurfaceSource(str(skin_file), "mm"))
     ports = replace(default_ports(anatomy), wall=wall)
-    found = PortSearch(anatomy, quick_reach(anatomy, table, ports), ports).run(3.0, 0, StepProgress())
+    found = PortSearch(anatomy, quick_reach(anatomy, table, ports), ports, dict.fromkeys(SIDES, (table,))).run(
+        3.0, 0, StepProgress()
+    )
     middle = anatomy.mesh.points.mean(axis=0)
     for port in found.best.ports.frames.values():
         assert np.linalg.norm(np.array(port.point) - middle) == pytest.approx(0.18, abs=1e-3)

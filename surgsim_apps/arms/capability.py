@@ -14,6 +14,7 @@ from msdm_core.mesh import FloatArray, IntArray
 from surgsim_apps.arms.clearance import segment_triangle_distance
 from surgsim_apps.arms.joint_search import approach_directions, from_directions, from_starts, spread_starts
 from surgsim_apps.arms.kinematics import BatchKinematics
+from surgsim_apps.arms.ports import vector
 from surgsim_apps.arms.reach import tip_ball
 from surgsim_env.instruments import load_arm, solve_pose
 from surgsim_env.scene import ArmDescription, Port
@@ -84,15 +85,17 @@ def shifted_bases(description: ArmDescription) -> list[ArmDescription]:
     Empty where the mechanism holds the shaft in the trocar.
     """
     arm, trocar = load_arm(description), description.trocar
-    shifts = np.eye(3)[:2] * BASE_SHIFT if not arm.remote_centre_fixed else np.zeros((0, 3))
+    if arm.remote_centre_fixed:
+        return []
     tip, shifted = arm.tip_pose(arm.home).position, []
-    for shift in np.concatenate([shifts, -shifts]):
+    for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        shift = BASE_SHIFT * np.array([x, y, 0.0])
         arm.trocar = shift @ Port(into=trocar.into).rotation
         home = solve_pose(arm, tip + arm.trocar)
         if home.reached:
-            x, y, z = (np.array(trocar.point) + shift).tolist()
+            moved = replace(trocar, point=vector(np.array(trocar.point) + shift))
             joints = dict(zip(arm.joints, home.joints.tolist(), strict=True))
-            shifted.append(replace(description, trocar=replace(trocar, point=(x, y, z)), home=joints))
+            shifted.append(replace(description, trocar=moved, home=joints))
     return shifted
 
 

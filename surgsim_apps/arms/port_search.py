@@ -123,12 +123,14 @@ class PortSearch:
 
     def _best_base(self, number: int, seed: int) -> Capability:
         """Table of the base from which an arm reaches most at the best quarter of a few sampled ports."""
-        side, reached = SIDES[number], []
+        side, tables, reached = SIDES[number], self._tables[SIDES[number]], []
+        if len(tables) == 1:
+            return tables[0]
         ports = [place.port for place in self._sampled(number, seed)[1].values()][:ALONE_AT_ONCE]
-        for table in self._tables[side] if len(self._tables[side]) > 1 else ():
+        for table in tables:
             self.quick.tables = {side: table}
             reached.append(np.sort(self.quick.alone(side, ports).sum(axis=1))[-(len(ports) // 4) :].sum())
-        return self._tables[side][int(np.argmax(reached)) if reached else 0]
+        return tables[int(np.argmax(reached))]
 
     def _begin(self, seed: int, seconds: float) -> FloatArray:
         """The given ports, and pairs of sampled ones with the most points that each arm of the pair reaches alone.

@@ -123,8 +123,8 @@ def test_bases_beside_their_place_keep_the_shaft_in_the_trocar():
     arm = read_description("six_axis")
     bases = shifted_bases(arm)
     shifts = [np.array(base.trocar.point) - arm.trocar.point for base in bases]
-    axes = BASE_SHIFT * np.eye(3)[:2]
-    assert np.array(shifts) == pytest.approx(np.concatenate([axes, -axes]), abs=1e-12)
+    x, y = BASE_SHIFT * np.eye(3)[:2]
+    assert np.array(shifts) == pytest.approx(np.array([x, -x, y, -y]), abs=1e-12)
     depth = -load_arm(arm).tip_pose(load_arm(arm).home).position[2]
     for base in bases:
         # The tip is as far past its trocar as it was.

@@ -44,7 +44,7 @@ def write_views(path: Path) -> None:
         pictures.append(np.asarray(small))
         renderer.close()
     rows = [np.concatenate(pictures[:2], axis=1), np.concatenate(pictures[2:], axis=1)]
-    Image.fromarray(np.concatenate(rows)).save(path, optimize=True)
+    Image.fromarray(np.concatenate(rows)).save(path, quality=88, method=6)
 
 
 def write_trace(path: Path) -> None:
@@ -74,7 +74,7 @@ def write_retraction(path: Path) -> None:
 def main() -> None:
     with output_folder(IMAGES) as images:
         write_trace(images / "trace.png")
-        write_views(images / "views.png")
+        write_views(images / "views.webp")
         write_retraction(images / "retraction.png")
         palpation = run_palpation(load_anatomy(make_scene("liver")))
         write_organ_picture(palpation, images / "palpation.png")

@@ -98,39 +98,36 @@ class PortSearch:
         self.quick.tables = self._given
         (given,) = _placements([self.ports], self.quick.evaluate([self.ports]))
         with progress.step(f"searching ports for at most {seconds:g} s") as advance:
-            self.quick.tables = {side: self._best_base(number, seed) for number, side in enumerate(SIDES)}
             begin: Any = self._begin(seed, 0.5 * seconds)
             differential_evolution(
                 losses, BOUNDS * 2, init=begin, vectorized=True, updating="deferred", tol=0.0, maxiter=10**6,
                 polish=False, callback=over, rng=seed,
             )  # fmt: skip
-        best, chosen, gains = tried[int(np.argmax(worths))], self.quick.tables, {}
-        for side in SIDES:
-            self.quick.tables = {**self._given, side: chosen[side]}
-            swapped = replace(self.ports, **{side: getattr(best.ports, side)})
-            gains[side] = float(self.quick.evaluate([swapped]).share[0])
-        self.quick.tables = chosen
+        best = tried[int(np.argmax(worths))]
+        swapped = [replace(self.ports, **{side: getattr(best.ports, side)}) for side in SIDES]
+        gains: dict[str, float] = dict(zip(SIDES, self.quick.evaluate(swapped).share.tolist(), strict=True))
+        gains["bases"] = self._with_best_bases(self.ports).share
+        best = self._with_best_bases(best.ports)
         seen = replace(best, ports=replace(best.ports, endoscope=self._endoscope(best.ports)))
-        moved = [side for side in SIDES if chosen[side] is not self._given[side]]
-        arms = {side: chosen[side].kinematics.arm.description for side in moved}
-        return PortsFound(given, seen, _front([given, *tried]), gains, len(tried), arms)
+        moved = [side for side in SIDES if self.quick.tables[side] is not self._given[side]]
+        arms = {side: self.quick.tables[side].kinematics.arm.description for side in moved}
+        return PortsFound(given, seen, _front([given, best, *tried]), gains, len(tried), arms)
 
-    def _sampled(self, number: int, seed: int) -> tuple[FloatArray, dict[int, PortPlace]]:
-        """Numbers of the sampled ports of an arm (ALONE, 3), and the places of those on the wall by row."""
-        low, high = np.transpose(BOUNDS)
-        sampled = low + (high - low) * qmc.Sobol(3, rng=np.random.default_rng([seed, number])).random(ALONE)
-        return sampled, {row: place for row, values in enumerate(sampled) if (place := self._place(values)) is not None}
+    def _with_best_bases(self, ports: Ports) -> Placement:
+        """The placement of ports with the bases of the greatest worth, whose tables `quick` keeps.
 
-    def _best_base(self, number: int, seed: int) -> Capability:
-        """Table of the base from which an arm reaches most at the best quarter of a few sampled ports."""
-        side, tables, reached = SIDES[number], self._tables[SIDES[number]], []
-        if len(tables) == 1:
-            return tables[0]
-        ports = [place.port for place in self._sampled(number, seed)[1].values()][:ALONE_AT_ONCE]
-        for table in tables:
-            self.quick.tables = {side: table}
-            reached.append(np.sort(self.quick.alone(side, ports).sum(axis=1))[-(len(ports) // 4) :].sum())
-        return tables[int(np.argmax(reached))]
+        Bases stay where others are better by less than WORTH_LEAST.
+        """
+        choices: list[dict[str, Capability]]
+        choices = [dict(zip(SIDES, pair, strict=True)) for pair in product(*(self._tables[side] for side in SIDES))]
+        figures = []
+        for self.quick.tables in choices:
+            figures.append(self.quick.evaluate([ports]))
+        worths = np.array([_worth(each)[0] for each in figures])
+        # The first are the bases in their places.
+        index = int(worths.argmax()) if worths.max() >= worths[0] + WORTH_LEAST else 0
+        self.quick.tables = choices[index]
+        return _placements([ports], figures[index])[0]
 
     def _begin(self, seed: int, seconds: float) -> FloatArray:
         """The given ports, and pairs of sampled ones with the most points that each arm of the pair reaches alone.
@@ -138,10 +135,11 @@ class PortSearch:
         Returns:
             Numbers of the first generation (GENERATION, 6).
         """
-        end, (low, high) = time.monotonic() + seconds, np.transpose(BOUNDS)
+        end, low, high = time.monotonic() + seconds, *np.transpose(BOUNDS)
         values, points, masks = [], [], []
         for number, side in enumerate(SIDES):
-            sampled, kept = self._sampled(number, seed)
+            sampled = low + (high - low) * qmc.Sobol(3, rng=np.random.default_rng([seed, number])).random(ALONE)
+            kept = {index: place for index, row in enumerate(sampled) if (place := self._place(row)) is not None}
             chosen, reached = [*kept], []
             for first in range(0, len(chosen), ALONE_AT_ONCE):
                 reached.append(

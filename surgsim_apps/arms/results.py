@@ -174,7 +174,8 @@ class PortsFound:
     Fields:
         given, best: placement to begin with, and the one of the greatest worth
         front: no placement of the search is better in one figure and not worse in the others; most reach first
-        gains: share of the points that both reach, with one port moved from given to best, by side
+        gains: share of the points that both reach, with one port moved from given to best, by side, and with the
+            "bases" alone in the best places
         count: number of placements tried
         arms: whose bases stand elsewhere in best, by side
     """

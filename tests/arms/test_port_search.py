@@ -105,17 +105,21 @@ def test_a_search_finds_ports_from_which_both_reach_all(anatomy, table):
 
 
 def test_a_search_puts_the_base_where_the_arm_reaches_more(anatomy, table, tmp_path):
-    """Tables of a slide that ends at 12 cm and of one that ends at 20 cm; the given ports keep the first."""
+    """Tables of a slide that ends at 12 cm, as given to the left arm, and of one that ends at 20 cm."""
     model = MODEL.replace(f'range="{NEAR} {FAR}"', f'range="{NEAR} 0.12"')
     short = read_description(write_pivot(tmp_path, model=model, sites=SITE))
     usual, short_table = on_one_wall(default_ports(anatomy)), Capability(short, 0.004)
-    quick = quick_reach(anatomy, short_table, usual)
-    share = quick.evaluate([usual]).share[0]
+    quick = quick_reach(anatomy, table, usual)
+    best = quick.evaluate([usual]).share[0]
+    quick.tables = {"left": short_table, "right": table}
+    given = quick.evaluate([usual]).share[0]
+    assert given < best
     search = PortSearch(anatomy, quick, usual, {"left": (short_table, table), "right": (table, short_table)})
-    found = search.run(5.0, 0, StepProgress())
-    assert found.given.share == share
+    found = search.run(1.0, 0, StepProgress())
+    assert (found.given.share, found.gains["bases"]) == (given, best)
     assert quick.tables == dict.fromkeys(SIDES, table)
-    assert found.arms == dict.fromkeys(SIDES, table.kinematics.arm.description)
+    assert found.arms == {"left": table.kinematics.arm.description}
+    assert found.best.share == quick.evaluate([found.best.ports]).share[0]
 
 
 def test_bases_beside_their_place_keep_the_shaft_in_the_trocar():

@@ -6,13 +6,16 @@ import shutil
 import pytest
 
 from surgsim_apps.arms import study
+from surgsim_apps.arms.capability import Capability
 from surgsim_apps.arms.ports import default_ports, read_ports
 from surgsim_apps.arms.study import make_tables
 from surgsim_apps.cli.main import main
+from surgsim_env.instruments import load_arm
+from surgsim_env.scene import read_description
 from surgsim_env.scene.anatomy import load_anatomy
 from surgsim_env.scene.load import make_scene, scenes_folder
 from tests.arms.made import made_evaluation
-from tests.arms.pivot_arm import write_pivot
+from tests.arms.pivot_arm import FAR, MODEL, NEAR, SITE, write_pivot
 
 INSTRUMENTS = scenes_folder() / "instruments"
 PORTS = """
@@ -51,7 +54,7 @@ def made(monkeypatch):
         return made_evaluation(count=count, seed=seed, left_to=reach, right_to=reach)
 
     monkeypatch.setattr(study, "evaluate_arms", evaluate)
-    monkeypatch.setattr(study, "make_tables", lambda *_: {})
+    monkeypatch.setattr(study, "make_tables", lambda *_, **__: {})
     return asked
 
 
@@ -63,14 +66,27 @@ def arguments(*more, left="psm_grasper", right="psm_palpator", ports="ports.toml
 
 
 def test_a_search_writes_the_ports_found_and_ranks_them_with_the_given(folder, made, monkeypatch, capsys):
-    monkeypatch.setattr(study, "make_tables", make_tables)
     arm = str(write_pivot(folder))
+    # The left arm reaches less from its base than from another one.
+    (folder / "short").mkdir()
+    short = write_pivot(
+        folder / "short", model=MODEL.replace(f'range="{NEAR} {FAR}"', f'range="{NEAR} 0.12"'), sites=SITE
+    )
+
+    def tables(setup, tip_radius, **_):
+        usual = make_tables(setup, tip_radius, shifted=False)
+        return usual | {"left": [Capability(read_description(short), tip_radius), *usual["left"]]}
+
+    monkeypatch.setattr(study, "make_tables", tables)
     assert main(arguments("--search", "2", left=arm, right=arm)) == 0
     found, given = (read_ports(path) for path in (folder / "out" / "ports.toml", folder / "ports.toml"))
     assert [ports for *_, ports in made] == [found, given]
     assert found != given and found.endoscope.target == given.endoscope.target
+    moved = read_description(folder / "out" / "left.toml")
+    assert load_arm(moved).upper[2] == FAR and not (folder / "out" / "right.toml").exists()
+    assert made[0][0].folder == folder
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    assert "placements were tried" in page and "ports found" in page
+    assert "placements were tried" in page and "ports found" in page and "The base of the left arm" in page
     header, best, *front = csv.reader((folder / "out" / "placements.csv").open())
     assert [float(best[header.index(f"left_{axis}_m")]) for axis in "xyz"] == pytest.approx(list(found.left.point))
     assert front

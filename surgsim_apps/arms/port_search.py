@@ -106,8 +106,9 @@ class PortSearch:
         best = tried[int(np.argmax(worths))]
         swapped = [replace(self.ports, **{side: getattr(best.ports, side)}) for side in SIDES]
         gains: dict[str, float] = dict(zip(SIDES, self.quick.evaluate(swapped).share.tolist(), strict=True))
-        gains["bases"] = self._with_best_bases(self.ports).share
-        best = self._with_best_bases(best.ports)
+        with progress.step("trying places of the bases"):
+            gains["bases"] = self._with_best_bases(self.ports).share
+            best = self._with_best_bases(best.ports)
         seen = replace(best, ports=replace(best.ports, endoscope=self._endoscope(best.ports)))
         moved = [side for side in SIDES if self.quick.tables[side] is not self._given[side]]
         arms = {side: self.quick.tables[side].kinematics.arm.description for side in moved}
